@@ -1,0 +1,1 @@
+"""Plants that ship with the package, one TOML each."""

@@ -1,0 +1,73 @@
+"""What one turn of the loop produced, for whoever shows or keeps it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from estimators.types import DampingCurve, Phasors, StateEstimate
+from tuning.types import Powers, Proposal
+from twin.control.schedule import Acknowledgement, Command
+from twin.plant.blocks import Block
+from twin.plant.linear import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something worth a line in the log."""
+
+    sample: int
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What became of a proposal, and who said so."""
+
+    sample: int
+    accepted: bool
+    by: Literal["automatic", "operator"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Performance:
+    """How the block went, at the excitation frequency.
+
+    Displacements are peak amplitudes [m] of the primary body: measured, predicted by the model without
+    control, and the least any linear controller can reach; NaN where the plant or the data cannot tell.
+    """
+
+    displacement_m: float
+    passive_m: float
+    limit_m: float
+    current_peak_a: float
+    powers: Powers
+    budget_w: float
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One block and everything the twin made of it.
+
+    Attributes
+    ----------
+    twin
+        (n_samples, n_sensors) outputs of the plant in parallel, stepped from the measured inputs alone, in the
+        order of ``estimate.sensors``.
+    estimate
+        The observer's.
+    phasors, curve, performance
+        None where the plant has no such part or the block no excitation.
+    """
+
+    block: Block
+    twin: Array
+    estimate: StateEstimate
+    phasors: Phasors | None
+    curve: DampingCurve | None
+    performance: Performance | None
+    proposal: Proposal | None
+    decision: Decision | None
+    command: Command | None
+    acknowledgements: tuple[Acknowledgement, ...]
+    events: tuple[Event, ...]
