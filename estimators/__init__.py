@@ -1,0 +1,1 @@
+"""Kalman observer, excitation tracker and damping identification: estimates with their uncertainty."""

@@ -1,0 +1,1 @@
+"""Retuning by convex optimisation under a power budget: limit, gains, verification, proposals."""

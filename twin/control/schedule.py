@@ -53,7 +53,9 @@ class GainSchedule(Frozen):
         n = len(self.frequency_hz)
         for name in ("alpha_kg", "beta_ns_m", "gamma_n_m", "low_pass_hz", "high_pass_hz"):
             if len(getattr(self, name)) != n:
-                raise ValueError(f"{name} has {len(getattr(self, name))} points, frequency_hz has {n}; give one each")
+                raise ValueError(
+                    f"{name} has {len(getattr(self, name))} points, frequency_hz has {n}; give one each"
+                )
         if any(b <= a for a, b in zip(self.frequency_hz, self.frequency_hz[1:], strict=False)):
             raise ValueError("frequency_hz must rise from point to point [Hz]")
         if self.on_from_hz > self.on_to_hz:
@@ -72,7 +74,9 @@ class GainSchedule(Frozen):
     def with_points(self, points: dict[int, Gains]) -> Self:
         """Return a copy in which some rows of the table are replaced."""
         columns = {
-            name: tuple(getattr(points[k], name) if k in points else old for k, old in enumerate(getattr(self, name)))
+            name: tuple(
+                getattr(points[k], name) if k in points else old for k, old in enumerate(getattr(self, name))
+            )
             for name in ("alpha_kg", "beta_ns_m", "gamma_n_m", "low_pass_hz", "high_pass_hz")
         }
         return self.model_copy(update=columns)

@@ -1,0 +1,1 @@
+"""The physics, once: parameters, linear models, exact discretisation, block kernels."""

@@ -6,7 +6,7 @@ not positive or not finite, bodies attached to nothing or to each other in a rin
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -82,7 +82,7 @@ class _Actuator(Frozen):
     @model_validator(mode="after")
     def _pushes_somewhere(self) -> Self:
         if (self.between is None) == (self.on is None):
-            raise ValueError("give either on = \"body\" or between = [\"first\", \"second\"]")
+            raise ValueError('give either on = "body" or between = ["first", "second"]')
         return self
 
     @property
@@ -127,7 +127,7 @@ class Shaker(_Coil):
         if self.drive == "voltage" and (self.resistance_ohm is None or self.inductance_h is None):
             raise ValueError(
                 "a voltage-driven shaker needs resistance_ohm and inductance_h "
-                "(or say drive = \"current\" for an ideal current source)"
+                '(or say drive = "current" for an ideal current source)'
             )
         return self
 
@@ -250,7 +250,9 @@ class Plant(Frozen):
 
     def with_damping(self, body: str, damping: float | DampingTable) -> "Plant":
         """Return a copy in which one body's damping [Ns/m] is replaced."""
-        bodies = tuple(b.model_copy(update={"damping_ns_m": damping}) if b.name == body else b for b in self.body)
+        bodies = tuple(
+            b.model_copy(update={"damping_ns_m": damping}) if b.name == body else b for b in self.body
+        )
         return self.model_copy(update={"body": bodies})
 
     @property
@@ -265,7 +267,15 @@ def fingerprint(model: BaseModel) -> str:
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
-def _named(things: tuple[Any, ...], name: str) -> Any:
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+T = TypeVar("T", bound=_Named)
+
+
+def _named(things: tuple[T, ...], name: str) -> T:
     for thing in things:
         if thing.name == name:
             return thing
@@ -282,7 +292,7 @@ def _check_attachments(attached_to: dict[str, str]) -> None:
     for name, parent in attached_to.items():
         if parent != GROUND and parent not in attached_to:
             raise ValueError(
-                f"body '{name}': attached_to = \"{parent}\" names no body; use \"{GROUND}\" or one of "
+                f'body \'{name}\': attached_to = "{parent}" names no body; use "{GROUND}" or one of '
                 f"{', '.join(sorted(attached_to))}"
             )
     for name in attached_to:
@@ -290,7 +300,9 @@ def _check_attachments(attached_to: dict[str, str]) -> None:
         while (parent := attached_to[trail[-1]]) != GROUND:
             if parent in trail:
                 ring = " -> ".join([*trail, parent])
-                raise ValueError(f"body '{name}': attached_to runs in a loop ({ring}); one must reach \"{GROUND}\"")
+                raise ValueError(
+                    f"body '{name}': attached_to runs in a loop ({ring}); one must reach \"{GROUND}\""
+                )
             trail.append(parent)
 
 
@@ -298,7 +310,9 @@ def _check_pushes(actuator: _Actuator, bodies: set[str]) -> None:
     places = [name for name, _ in actuator.pushes]
     for place in places:
         if place != GROUND and place not in bodies:
-            raise ValueError(f"actuator '{actuator.name}': '{place}' names no body; known: {', '.join(sorted(bodies))}")
+            raise ValueError(
+                f"actuator '{actuator.name}': '{place}' names no body; known: {', '.join(sorted(bodies))}"
+            )
     if len(set(places)) < len(places) or set(places) == {GROUND}:
         raise ValueError(f"actuator '{actuator.name}': it must push a body against something else")
 

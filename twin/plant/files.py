@@ -48,7 +48,13 @@ def load_plant(name_or_path: str | Path) -> Plant:
 @cache
 def preset_names() -> tuple[str, ...]:
     """Names of the plants that ship with the package, sorted."""
-    return tuple(sorted(p.name.removesuffix(".toml") for p in files("twin.plant.presets").iterdir() if p.name.endswith(".toml")))
+    return tuple(
+        sorted(
+            p.name.removesuffix(".toml")
+            for p in files("twin.plant.presets").iterdir()
+            if p.name.endswith(".toml")
+        )
+    )
 
 
 @cache
@@ -68,7 +74,9 @@ def read_toml(path: Path, model: type[M]) -> M:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({_reason(error)}); check the path and that it is UTF-8 text") from error
+        raise InputError(
+            f"{path}: cannot be read ({_reason(error)}); check the path and that it is UTF-8 text"
+        ) from error
     return parse_toml(text, model, str(path))
 
 
@@ -87,7 +95,9 @@ def parse_toml(text: str, model: type[M], where: str) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [_explain(problem, data) for problem in error.errors()]
+        problems = error.errors()
+        # A list emptied by errors in its entries is no error of its own.
+        lines = [_explain(p, data) for p in problems if p["type"] != "too_short" or len(problems) == 1]
         raise InputError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines))) from error
 
 
@@ -148,7 +158,9 @@ def _locate(loc: tuple[Any, ...], data: dict[str, Any]) -> tuple[str, str]:
             node = node[part] if isinstance(node, list) and part < len(node) else None
             label = f"[{part}]" + (f" '{node['name']}'" if isinstance(node, dict) and "name" in node else "")
             words[-1:] = [words[-1] + label] if words else [label]
-        elif isinstance(node, dict) and (part in node or part not in ("voice_coil", "shaker", "force", "float", "DampingTable")):
+        elif isinstance(node, dict) and (
+            part in node or part not in ("voice_coil", "shaker", "force", "float", "DampingTable")
+        ):
             node = node.get(part)
             words.append(str(part))
             key = str(part)

@@ -136,11 +136,17 @@ def linear_model(
     for sensor in plant.sensor:
         if sensor.kind == "voltage" and sensor.of not in {a.name for a in circuits}:
             continue  # its circuit is left out of this model
-        c, d = _sensor_row(sensor, order, index, A, B, (force_x, force_u, current_x, current_u, volt_x, volt_u))
+        c, d = _sensor_row(
+            sensor, order, index, A, B, (force_x, force_u, current_x, current_u, volt_x, volt_u)
+        )
         rows_c.append(c)
         rows_d.append(d)
         kept.append(sensor.name)
-    states = tuple(f"x_{b}" for b in order) + tuple(f"v_{b}" for b in order) + tuple(f"i_{a.name}" for a in circuits)
+    states = (
+        tuple(f"x_{b}" for b in order)
+        + tuple(f"v_{b}" for b in order)
+        + tuple(f"i_{a.name}" for a in circuits)
+    )
     return LinearModel(
         A=read_only(A),
         B=read_only(B),
@@ -152,10 +158,15 @@ def linear_model(
     )
 
 
-def natural_frequencies_hz(model: LinearModel) -> Array:
-    """Natural frequencies [Hz] of the oscillating poles, ascending (thesis eq. 3-17, 3-18 for two bodies)."""
-    poles = np.linalg.eigvals(model.A)
-    return np.sort(np.abs(poles[poles.imag > 0.0])) / (2.0 * np.pi)
+def natural_frequencies_hz(plant: Plant) -> Array:
+    """Undamped natural frequencies [Hz], ascending (thesis eq. 3-17, 3-18 for two bodies).
+
+    Coils are open and dampers left out: the square roots of the eigenvalues of M^-1 K over 2 pi.
+    """
+    order = {body.name: row for row, body in enumerate(plant.body)}
+    mass, _, K = _mechanics(plant, {body.name: 0.0 for body in plant.body}, order)
+    scale = 1.0 / np.sqrt(mass)
+    return np.sqrt(np.linalg.eigvalsh(scale[:, None] * K * scale)) / (2.0 * np.pi)
 
 
 def _has_circuit(actuator: VoiceCoil | Shaker | ForceActuator) -> bool:
@@ -169,7 +180,9 @@ def _direct_gain(actuator: VoiceCoil | Shaker | ForceActuator, coil_forces: bool
     return 1.0 if coil_forces and isinstance(actuator, VoiceCoil) else actuator.force_constant_n_a
 
 
-def _mechanics(plant: Plant, damping: Mapping[str, float], order: Mapping[str, int]) -> tuple[Array, Array, Array]:
+def _mechanics(
+    plant: Plant, damping: Mapping[str, float], order: Mapping[str, int]
+) -> tuple[Array, Array, Array]:
     n = len(order)
     mass = np.array([b.mass_kg for b in plant.body])
     C, K = np.zeros((n, n)), np.zeros((n, n))
@@ -184,7 +197,13 @@ def _mechanics(plant: Plant, damping: Mapping[str, float], order: Mapping[str, i
 
 
 def _circuit(
-    coil: VoiceCoil | Shaker | ForceActuator, push: Array, row: int, column: int, A: Array, B: Array, volt: tuple[Array, Array]
+    coil: VoiceCoil | Shaker | ForceActuator,
+    push: Array,
+    row: int,
+    column: int,
+    A: Array,
+    B: Array,
+    volt: tuple[Array, Array],
 ) -> None:
     """Add ``L i' = v - R i - k E' x'``; with a current loop ``v = kp (i_ref - i)`` (thesis eq. 7-4, 8-1)."""
     if isinstance(coil, ForceActuator) or coil.resistance_ohm is None or coil.inductance_h is None:
@@ -200,7 +219,12 @@ def _circuit(
 
 
 def _sensor_row(
-    sensor: Sensor, order: Mapping[str, int], index: Mapping[str, int], A: Array, B: Array, rows: tuple[Array, ...]
+    sensor: Sensor,
+    order: Mapping[str, int],
+    index: Mapping[str, int],
+    A: Array,
+    B: Array,
+    rows: tuple[Array, ...],
 ) -> tuple[Array, Array]:
     n = len(order)
     if sensor.kind in ("displacement", "velocity", "acceleration"):
@@ -218,5 +242,7 @@ def _sensor_row(
         return c, d
     column = index[str(sensor.of)]
     force_x, force_u, current_x, current_u, volt_x, volt_u = rows
-    x, u = {"force": (force_x, force_u), "current": (current_x, current_u), "voltage": (volt_x, volt_u)}[sensor.kind]
+    x, u = {
+        "force": (force_x, force_u), "current": (current_x, current_u), "voltage": (volt_x, volt_u)
+    }[sensor.kind]  # fmt: skip
     return x[column].copy(), u[column].copy()

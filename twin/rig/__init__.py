@@ -1,0 +1,1 @@
+"""Where blocks come from and commands go: simulated rig, live gateway, file readers, recorder."""

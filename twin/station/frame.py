@@ -52,8 +52,8 @@ class Frame:
     Attributes
     ----------
     twin
-        (n_samples, n_sensors) outputs of the plant in parallel, stepped from the measured inputs alone, in the
-        order of ``estimate.sensors``.
+        (n_samples, n_sensors) outputs of the plant in parallel, stepped from the measured inputs alone, in
+        the order of ``estimate.sensors``.
     estimate
         The observer's.
     phasors, curve, performance
