@@ -6,6 +6,7 @@ not positive or not finite, bodies attached to nothing or to each other in a rin
 
 import hashlib
 import json
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
@@ -16,6 +17,8 @@ GROUND = "ground"
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+# Where a channel lies in foreign recordings: array, array:unit or array[:,2]:unit.
+RecordedAs = Annotated[str, Field(pattern=r"^[^\[\]:]+(\[[^\[\]]*\])?(:[^:]+)?$")]
 
 MOTION_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 SENSOR_UNITS = MOTION_UNITS | {"current": "A", "voltage": "V", "force": "N"}
@@ -39,7 +42,7 @@ class DampingTable(Frozen):
             raise ValueError(
                 f"frequency_hz has {len(self.frequency_hz)} points and ns_m {len(self.ns_m)}; give one each"
             )
-        if any(b <= a for a, b in zip(self.frequency_hz, self.frequency_hz[1:], strict=True)):
+        if any(b <= a for a, b in pairwise(self.frequency_hz)):
             raise ValueError("frequency_hz must rise from point to point [Hz]")
         return self
 
@@ -49,13 +52,18 @@ class DampingTable(Frozen):
 
 
 class Body(Frozen):
-    """A rigid mass on a spring and a damper to the body (or the ground) it is attached to."""
+    """A rigid mass on a spring and a damper to the body (or the ground) it is attached to.
+
+    ``disturbance_density_n`` is the one-sided density [N/sqrt(Hz)] of the white force that an observer may
+    suppose to act on the body beside the known ones; None leaves it to the observer.
+    """
 
     name: Name
     mass_kg: Positive
     attached_to: str
     stiffness_n_m: Positive
     damping_ns_m: NonNegative | DampingTable
+    disturbance_density_n: NonNegative | None = None
 
     def damping_at(self, frequency_hz: float | None) -> float:
         """Damping [Ns/m] at a frequency [Hz]; a plain number is the same at every frequency.
@@ -73,11 +81,12 @@ class Body(Frozen):
 
 
 class _Actuator(Frozen):
-    """What all actuators share: a place to push."""
+    """What all actuators share: a place to push, and where recordings keep the command."""
 
     name: Name
     between: tuple[str, str] | None = None
     on: str | None = None
+    recorded_as: RecordedAs | None = None
 
     @model_validator(mode="after")
     def _pushes_somewhere(self) -> Self:
@@ -153,13 +162,17 @@ Actuator = Annotated[VoiceCoil | Shaker | ForceActuator, Field(discriminator="ki
 
 
 class Sensor(Frozen):
-    """A measured channel. ``noise_density`` is one-sided, in the sensor's SI unit per sqrt(Hz)."""
+    """A measured channel. ``noise_density`` is one-sided, in the sensor's SI unit per sqrt(Hz).
+
+    ``recorded_as`` names it in foreign recordings: ``"y:mm"`` for an array y in mm.
+    """
 
     name: Name
     kind: Literal["displacement", "velocity", "acceleration", "current", "voltage", "force"]
     of: str | tuple[str, str]
     noise_density: Positive
     range: Positive | None = None
+    recorded_as: RecordedAs | None = None
 
     @property
     def unit(self) -> str:
@@ -328,7 +341,8 @@ def _check_sensor(sensor: Sensor, bodies: set[str], actuators: dict[str, Any]) -
     for name in names:
         if name not in known:
             raise ValueError(
-                f"sensor '{sensor.name}': of = \"{name}\" names no {what}; known: {', '.join(sorted(known)) or 'none'}"
+                f"sensor '{sensor.name}': of = \"{name}\" names no {what}; "
+                f"known: {', '.join(sorted(known)) or 'none'}"
             )
     if sensor.kind in ("current", "voltage") and isinstance(actuators[names[0]], ForceActuator):
         raise ValueError(f"sensor '{sensor.name}': a force actuator has no {sensor.kind}")

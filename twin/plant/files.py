@@ -15,8 +15,9 @@ M = TypeVar("M", bound=BaseModel)
 
 # Longest suffix first: damping_ns_m is Ns/m, not m.
 _UNITS = {
-    "_ns_m": "Ns/m", "_n_m": "N/m", "_n_a": "N/A", "_n_v": "N/V", "_v_a": "V/A", "_kg": "kg", "_ohm": "Ω",
-    "_hz": "Hz", "_us": "µs", "_ms": "ms", "_h": "H", "_a": "A", "_v": "V", "_w": "W", "_n": "N", "_m": "m", "_s": "s",
+    "_density_n": "N/√Hz", "_ns_m": "Ns/m", "_n_m": "N/m", "_n_a": "N/A", "_n_v": "N/V", "_v_a": "V/A",
+    "_kg": "kg", "_ohm": "Ω", "_hz": "Hz", "_us": "µs", "_ms": "ms", "_h": "H", "_a": "A", "_v": "V",
+    "_w": "W", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
 
 
@@ -106,7 +107,7 @@ def _reason(error: Exception) -> str:
 
 
 def unit_of(key: str) -> str | None:
-    """Unit that a key's suffix states, such as ``kg`` for ``mass_kg``; None where it states none."""
+    """Return the unit that a key's suffix states, such as ``kg`` for ``mass_kg``; None where it states none."""
     key = "ns_m" if key == "ns_m" else key
     return next((unit for suffix, unit in _UNITS.items() if f"_{key}".endswith(suffix)), None)
 
@@ -136,9 +137,11 @@ def _explain(problem: Any, data: dict[str, Any]) -> str:
         case "value_error":
             return f"{label}: {context['error']}" if place else str(context["error"])
         case "union_tag_not_found":
-            return f"{place}: kind is missing; use one of {context.get('expected_tags', 'voice_coil, shaker, force')}"
+            return f"{place}: kind is missing; use one of 'voice_coil', 'shaker', 'force'"
         case "union_tag_invalid":
             return f"{place}: kind must be one of {context['expected_tags']}, got {context['tag']!r}"
+        case "string_pattern_mismatch" if key == "recorded_as":
+            return f'{label}: must be "array", "array:unit" or "array[:,2]:unit"{got}'
         case "string_pattern_mismatch":
             return f"{label}: must begin with a letter and hold letters, digits and _ only{got}"
         case "too_short":
