@@ -1,6 +1,7 @@
 """What the rig's controller runs by: gains and cutoffs against excitation frequency, and when to act."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -56,7 +57,7 @@ class GainSchedule(Frozen):
                 raise ValueError(
                     f"{name} has {len(getattr(self, name))} points, frequency_hz has {n}; give one each"
                 )
-        if any(b <= a for a, b in zip(self.frequency_hz, self.frequency_hz[1:], strict=False)):
+        if any(b <= a for a, b in pairwise(self.frequency_hz)):
             raise ValueError("frequency_hz must rise from point to point [Hz]")
         if self.on_from_hz > self.on_to_hz:
             raise ValueError("on_from_hz must not be above on_to_hz [Hz]")

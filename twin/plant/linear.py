@@ -5,7 +5,7 @@ Bodies give ``M x'' + C x' + K x = sum(E_a f_a)``; each coil driven by a voltage
 instant (the energy-conserving sign; the thesis's eq. 7-3 has the opposite one, which creates energy).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,8 +71,7 @@ def linear_model(
     *,
     frequency_hz: float | None = None,
     damping_ns_m: Mapping[str, float] | None = None,
-    coil_forces: bool = False,
-    open_circuit: tuple[str, ...] = (),
+    current_driven: Collection[str] = (),
 ) -> LinearModel:
     """State-space model of a plant (thesis eq. 5-1, 7-2, 7-3 with the energy-conserving sign).
 
@@ -82,10 +81,9 @@ def linear_model(
         Where to read damping that is given against frequency [Hz].
     damping_ns_m
         Damping [Ns/m] by body name, in place of the plant's own.
-    coil_forces
-        Take the voice coil's force [N] as the input and leave its circuit out.
-    open_circuit
-        Coils that carry no current; their input then does nothing.
+    current_driven
+        Coils whose current [A] is the input, whatever their circuit: an ideal current source. With no
+        current this is the open coil.
 
     Raises
     ------
@@ -100,10 +98,7 @@ def linear_model(
     n = len(order)
     mass, C, K = _mechanics(plant, damping, order)
 
-    circuits = [
-        a for a in plant.actuator
-        if a.name not in open_circuit and _has_circuit(a) and not (coil_forces and isinstance(a, VoiceCoil))
-    ]  # fmt: skip
+    circuits = [a for a in plant.actuator if a.name not in current_driven and _has_circuit(a)]
     size = 2 * n + len(circuits)
     A, B = np.zeros((size, size)), np.zeros((size, len(plant.actuator)))
     A[:n, n : 2 * n] = np.eye(n)
@@ -123,8 +118,8 @@ def linear_model(
             _circuit(a, push, 2 * n + circuits.index(a), column, A, B, (volt_x, volt_u))
             current_x[column, 2 * n + circuits.index(a)] = 1.0
             force_x[column, 2 * n + circuits.index(a)] = getattr(a, "force_constant_n_a", 0.0)
-        elif a.name not in open_circuit:
-            gain = _direct_gain(a, coil_forces)
+        else:
+            gain = _direct_gain(a)
             force_u[column, column] = gain
             current_u[column, column] = gain / getattr(a, "force_constant_n_a", np.inf)
         A[n : 2 * n] += np.outer(push / mass, force_x[column])
@@ -166,18 +161,18 @@ def natural_frequencies_hz(plant: Plant) -> Array:
     order = {body.name: row for row, body in enumerate(plant.body)}
     mass, _, K = _mechanics(plant, {body.name: 0.0 for body in plant.body}, order)
     scale = 1.0 / np.sqrt(mass)
-    return np.sqrt(np.linalg.eigvalsh(scale[:, None] * K * scale)) / (2.0 * np.pi)
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(scale[:, None] * K * scale)) / (2.0 * np.pi))
 
 
 def _has_circuit(actuator: VoiceCoil | Shaker | ForceActuator) -> bool:
     return isinstance(actuator, VoiceCoil) or (isinstance(actuator, Shaker) and actuator.drive == "voltage")
 
 
-def _direct_gain(actuator: VoiceCoil | Shaker | ForceActuator, coil_forces: bool) -> float:
+def _direct_gain(actuator: VoiceCoil | Shaker | ForceActuator) -> float:
     """Force per unit of input for actuators without a circuit in the model."""
     if isinstance(actuator, ForceActuator):
         return actuator.force_constant_n_v or 1.0
-    return 1.0 if coil_forces and isinstance(actuator, VoiceCoil) else actuator.force_constant_n_a
+    return actuator.force_constant_n_a
 
 
 def _mechanics(

@@ -1,0 +1,96 @@
+"""Which recorded channel drives each actuator of the model, and how it is held between samples."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.plant.config import ForceActuator, Plant
+from twin.plant.discrete import DiscreteModel, Hold, discretise
+from twin.plant.linear import Array, LinearModel, linear_model
+
+
+@dataclass(frozen=True, slots=True)
+class InputSource:
+    """Where an actuator's input comes from.
+
+    Attributes
+    ----------
+    actuator
+        The actuator's name.
+    channel
+        The recorded channel; None if nothing recorded tells, and the input is taken as zero.
+    hold
+        A command from a converter is held; a measured signal is joined linearly.
+    by_current
+        True if the channel is the coil's measured current, so that its circuit leaves the model.
+    noise_density
+        One-sided, of the channel [unit/sqrt(Hz)]; 0 for a command.
+    """
+
+    actuator: str
+    channel: str | None
+    hold: Hold
+    by_current: bool = False
+    noise_density: float = 0.0
+
+
+def choose_inputs(plant: Plant, channels: Sequence[str]) -> tuple[InputSource, ...]:
+    """For each actuator: its recorded command, else its measured voltage, else its measured current.
+
+    The command comes first because the rig holds it exactly as the model does. A voice coil's terminal
+    voltage behind a current loop does not: it jumps within a sample and its samples miss that, so there the
+    current is the better second choice.
+    """
+    sources = []
+    for actuator in plant.actuator:
+        source = InputSource(actuator.name, None, "zoh")
+        if actuator.name in channels:
+            source = InputSource(actuator.name, actuator.name, "zoh")
+        elif not isinstance(actuator, ForceActuator):
+            wanted = ["current"] if actuator.input_unit == "A" else ["voltage", "current"]
+            measured = {s.kind: s for s in plant.sensor if s.of == actuator.name and s.name in channels}
+            for kind in wanted:
+                if kind in measured:
+                    sensor = measured[kind]
+                    source = InputSource(
+                        actuator.name, sensor.name, "foh", kind == "current", sensor.noise_density
+                    )
+                    break
+        else:
+            forces = [
+                s for s in plant.sensor if s.kind == "force" and s.of == actuator.name and s.name in channels
+            ]
+            if forces and actuator.force_constant_n_v is None:
+                source = InputSource(actuator.name, forces[0].name, "foh", False, forces[0].noise_density)
+        sources.append(source)
+    return tuple(sources)
+
+
+def driven_model(
+    plant: Plant, sources: Sequence[InputSource], sample_rate_hz: float, frequency_hz: float | None
+) -> tuple[LinearModel, DiscreteModel]:
+    """Continuous and exactly discretised model of a plant driven by recorded channels.
+
+    Parameters
+    ----------
+    frequency_hz
+        Where damping given against frequency is read [Hz].
+    """
+    by_current = [s.actuator for s in sources if s.by_current]
+    model = linear_model(plant, frequency_hz=frequency_hz, current_driven=by_current)
+    return model, discretise(model, sample_rate_hz, [s.hold for s in sources])
+
+
+def input_columns(sources: Sequence[InputSource], channels: Sequence[str]) -> tuple[int, ...]:
+    """Column of each input in a block with these channels; -1 where nothing is recorded."""
+    return tuple(channels.index(s.channel) if s.channel is not None else -1 for s in sources)
+
+
+def gather(values: Array, columns: Sequence[int]) -> Array:
+    """Inputs (N, m) from a block's values (N, n_channels); zero where nothing is recorded."""
+    u = np.zeros((len(values), len(columns)))
+    for j, column in enumerate(columns):
+        if column >= 0:
+            u[:, j] = values[:, column]
+    return u

@@ -1,0 +1,77 @@
+"""What a simulated rig is told to do: excitation, controller at start, and the truth the twin does not know."""
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from twin.control.schedule import GainSchedule
+from twin.plant.config import DampingTable, Frozen, NonNegative, Plant, Positive
+
+
+class Sweep(Frozen):
+    """Shaker voltage of constant amplitude whose frequency moves linearly from one end to the other."""
+
+    from_hz: Positive
+    to_hz: Positive
+    duration_s: Positive
+    amplitude_v: Positive
+
+
+class Programme(Frozen):
+    """One run of the simulated rig.
+
+    Attributes
+    ----------
+    plant
+        The true plant but for its absorber's damping, which is ``true_damping``.
+    seed
+        Seeds sensor noise and ground motion, and nothing else.
+    measurement
+        ``relative``: both accelerometers; ``absolute``: the absorber's alone stands for the difference.
+    loop_delay_samples
+        Samples between measuring and the converter's update; the hold adds half a sample on average.
+    disturbance_density_n
+        White force on the primary body, N per sqrt(Hz), one-sided.
+    """
+
+    plant: Plant
+    true_damping: DampingTable
+    sweep: Sweep
+    schedule: GainSchedule
+    measurement: Literal["relative", "absolute"] = "relative"
+    sample_rate_hz: Positive = 50_000.0
+    block_samples: int = Field(default=5_000, ge=10)
+    loop_delay_samples: int = Field(default=1, ge=1, le=100)
+    disturbance_density_n: NonNegative = 0.01
+    seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _limits_fail_closed(self) -> Self:
+        coil = self.plant.voice_coil
+        if coil is None or coil.current_loop_kp_v_a is None or coil.between is None:
+            raise ValueError("a rig needs a voice coil between two bodies, with a current loop")
+        for key in (f"{coil.name}_current_a", f"{coil.name}_power_w", "stroke_m"):
+            if key not in self.plant.limits:
+                unit = self.plant.limit_units[key]
+                raise ValueError(
+                    f"limits.{key} [{unit}] is missing: without it the coil may not be driven; add it"
+                )
+        return self
+
+    @property
+    def true_plant(self) -> Plant:
+        """The plant as it really is."""
+        absorber = self.plant.absorber
+        if absorber is None:
+            raise ValueError("the plant has no absorber")
+        return self.plant.with_damping(absorber.name, self.true_damping)
+
+    @property
+    def n_blocks(self) -> int:
+        """Whole blocks in the run."""
+        return int(self.sweep.duration_s * self.sample_rate_hz) // self.block_samples
+
+    @property
+    def block_s(self) -> float:
+        """Duration of a block [s]."""
+        return self.block_samples / self.sample_rate_hz

@@ -1,0 +1,306 @@
+"""The simulated rig: true plant, sensors, filter chain, controller and its limits, one block at a time.
+
+It stands where the real rig will: it knows the truth, obeys commands at block boundaries, and enforces its own
+limits whatever it is told.
+"""
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.control.chain import CHAIN_STATES, chain_step
+from twin.control.schedule import Acknowledgement, Command, GainSchedule
+from twin.plant.blocks import Channel
+from twin.plant.compiled import kernel
+from twin.plant.config import Shaker, VoiceCoil
+from twin.plant.discrete import DiscreteModel, discretise
+from twin.plant.linear import Array, LinearModel, linear_model
+from twin.rig.programme import Programme
+
+POWER_WINDOW_BLOCKS = 10
+
+
+@kernel
+def rig_block(
+    F: Array,
+    B0: Array,
+    B1: Array,
+    C: Array,
+    D: Array,
+    kick: Array,
+    x: Array,
+    u_before: Array,
+    chain: Array,
+    delay_line: Array,
+    drive: Array,
+    disturbance: Array,
+    noise: Array,
+    pick: Array,
+    gains_from: Array,
+    gains_to: Array,
+    on: bool,
+    clamp: float,
+    dt: float,
+    coil_input: int,
+    shaker_input: int,
+    y: Array,
+    reference: Array,
+) -> float:
+    """Run plant and controller through one block, in place.
+
+    Parameters
+    ----------
+    F, B0, B1, C, D
+        Discrete plant, as `DiscreteModel`.
+    kick
+        (n,) change of state per newton of disturbance held over a sample.
+    x, u_before, chain, delay_line
+        State carried from block to block: plant (n,), last inputs (m,), filter chain (6,), commands computed
+        but not yet at the converter (d,) [A].
+    drive
+        (N,) shaker voltage [V].
+    disturbance
+        (N,) force on the primary body [N], held over the sample before.
+    noise
+        (N, p) sensor noise.
+    pick
+        (p,) weights that form the relative acceleration from the sensors.
+    gains_from, gains_to
+        (5,) alpha/k, beta/k, gamma/k [A per SI unit] and tan(pi f dt) of both cutoffs at the block's ends;
+        linear between.
+    on
+        Whether the controller acts; the filter chain runs in any case.
+    clamp
+        Largest current reference [A].
+    y
+        (N, p) receives the measured sensors.
+    reference
+        (N,) receives the current reference at the converter [A].
+
+    Returns
+    -------
+    float
+        Largest filtered relative displacement in the block [m].
+    """
+    n_samples, n, m, p = len(drive), F.shape[0], B0.shape[1], C.shape[0]
+    d = len(delay_line)
+    fresh, u = np.empty(n), np.empty(m)
+    stroke = 0.0
+    for k in range(n_samples):
+        for j in range(m):
+            u[j] = 0.0
+        # What the converter holds from this sample on was computed d samples ago.
+        u[coil_input] = delay_line[0]
+        u[shaker_input] = drive[k]
+        for i in range(n):
+            total = kick[i] * disturbance[k]
+            for j in range(n):
+                total += F[i, j] * x[j]
+            for j in range(m):
+                total += B0[i, j] * u_before[j] + B1[i, j] * u[j]
+            fresh[i] = total
+        relative = 0.0
+        for i in range(n):
+            x[i] = fresh[i]
+        for j in range(m):
+            u_before[j] = u[j]
+        for i in range(p):
+            total = noise[k, i]
+            for j in range(n):
+                total += C[i, j] * x[j]
+            for j in range(m):
+                total += D[i, j] * u[j]
+            y[k, i] = total
+            relative += pick[i] * total
+        reference[k] = u[coil_input]
+
+        w = k / n_samples
+        g_low = gains_from[3] + w * (gains_to[3] - gains_from[3])
+        g_high = gains_from[4] + w * (gains_to[4] - gains_from[4])
+        a, v, s = chain_step(chain, relative, g_low, g_high, dt)
+        command = 0.0
+        if on:
+            command = (
+                (gains_from[0] + w * (gains_to[0] - gains_from[0])) * a
+                + (gains_from[1] + w * (gains_to[1] - gains_from[1])) * v
+                + (gains_from[2] + w * (gains_to[2] - gains_from[2])) * s
+            )
+            command = min(max(command, -clamp), clamp)
+        for j in range(d - 1):
+            delay_line[j] = delay_line[j + 1]
+        delay_line[d - 1] = command
+        stroke = max(stroke, abs(s))
+    return stroke
+
+
+class SimulatedRig:
+    """A rig in software, advanced block by block.
+
+    Parameters
+    ----------
+    programme
+        What to do and what is true.
+    """
+
+    def __init__(self, programme: Programme) -> None:
+        self.programme = programme
+        plant = programme.true_plant
+        coil = plant.voice_coil
+        shaker = next((a for a in plant.actuator if isinstance(a, Shaker)), None)
+        if coil is None or coil.between is None or shaker is None:
+            raise ValueError("the simulated rig needs a voice coil and a shaker")
+        self._plant, self._coil = plant, coil
+        self._inputs = tuple(a.name for a in plant.actuator)
+        self._coil_input, self._shaker_input = self._inputs.index(coil.name), self._inputs.index(shaker.name)
+        self.channels = (
+            *(Channel(s.name, s.unit) for s in plant.sensor),
+            Channel(coil.name, coil.input_unit),
+        )
+        self._pick = _relative_acceleration(programme, coil)
+        self._ranges = np.array([s.range or math.inf for s in plant.sensor])
+        fs = programme.sample_rate_hz
+        self._noise_std = np.sqrt([s.noise_variance(fs) for s in plant.sensor])
+        self._force_std = programme.disturbance_density_n * math.sqrt(fs / 2.0)
+        self._rng = np.random.default_rng(programme.seed)
+
+        self.schedule: GainSchedule = programme.schedule
+        self.control_enabled = True
+        self.tripped = ""
+        self.next_sample = 0
+        self._pending: list[Command] = []
+        self._heating: deque[float] = deque(maxlen=POWER_WINDOW_BLOCKS)
+        model = self._model(self.frequency_at(0))
+        n = len(model.states)
+        self._x, self._u_before = np.zeros(n), np.zeros(len(self._inputs))
+        self._chain, self._delay_line = np.zeros(CHAIN_STATES), np.zeros(programme.loop_delay_samples)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the programme is over."""
+        return self.next_sample >= self.programme.n_blocks * self.programme.block_samples
+
+    def frequency_at(self, sample: int) -> float:
+        """Excitation frequency at a sample [Hz]."""
+        sweep = self.programme.sweep
+        t = sample / self.programme.sample_rate_hz
+        return sweep.from_hz + (sweep.to_hz - sweep.from_hz) * min(t / sweep.duration_s, 1.0)
+
+    def accept(self, command: Command) -> None:
+        """Take a command in; it acts from the first block that begins at or after its sample."""
+        self._pending.append(command)
+
+    def next_block(self) -> tuple[NDArray[np.float32], bool, list[Acknowledgement]]:
+        """Advance by one block.
+
+        Returns
+        -------
+        values
+            (block_samples, n_channels) float32, as a 24-bit converter would give them, in the order of
+            ``channels``.
+        control_on
+            Whether the controller acted during the block.
+        acknowledgements
+            Of the commands that took effect at the block's first sample.
+        """
+        programme = self.programme
+        n, fs = programme.block_samples, programme.sample_rate_hz
+        first = self.next_sample
+        acknowledgements = self._apply_due(first)
+        f_from, f_to = self.frequency_at(first), self.frequency_at(first + n)
+        middle = 0.5 * (f_from + f_to)
+        on = self.control_enabled and not self.tripped and self.schedule.acts_at(middle)
+
+        model = self._model(middle)
+        discrete = self._discretise(model)
+        drive = self._shaker_voltage(first, n)
+        disturbance = self._rng.normal(0.0, self._force_std, n) if self._force_std > 0.0 else np.zeros(n)
+        noise = self._rng.standard_normal((n, len(self._noise_std))) * self._noise_std
+        y, reference = np.empty((n, len(self._noise_std))), np.empty(n)
+        stroke = rig_block(
+            discrete.F, discrete.B0, discrete.B1, discrete.C, discrete.D, self._kick(model),
+            self._x, self._u_before, self._chain, self._delay_line, drive, disturbance, noise, self._pick,
+            self._packed(f_from), self._packed(f_to), on, self._plant.limits[f"{self._coil.name}_current_a"],
+            1.0 / fs, self._coil_input, self._shaker_input, y, reference,
+        )  # fmt: skip
+        np.clip(y, -self._ranges, self._ranges, out=y)
+        self._guard(stroke, reference)
+        self.next_sample = first + n
+        return np.column_stack([y, reference]).astype(np.float32), on, acknowledgements
+
+    def _apply_due(self, first: int) -> list[Acknowledgement]:
+        due = [c for c in self._pending if c.apply_at_sample <= first]
+        self._pending = [c for c in self._pending if c.apply_at_sample > first]
+        answers = []
+        for command in due:
+            late = first - command.apply_at_sample
+            if command.schedule is not None:
+                self.schedule = command.schedule
+            if command.control_enabled is not None:
+                self.control_enabled = command.control_enabled
+                self.tripped = "" if command.control_enabled else self.tripped
+            reason = f"{late} samples late" if late > 0 else ""
+            answers.append(
+                Acknowledgement(
+                    command_id=command.command_id, accepted=True, applied_at_sample=first, reason=reason
+                )
+            )
+        return answers
+
+    def _guard(self, stroke: float, reference: Array) -> None:
+        """Switch control off when stroke or mean coil power pass the plant's limits; the clamp bounds current."""
+        limits, name = self._plant.limits, self._coil.name
+        self._heating.append(self._coil.resistance_ohm * float(np.mean(reference**2)))
+        power = sum(self._heating) / len(self._heating)
+        if stroke > limits["stroke_m"]:
+            self.tripped = f"stroke {stroke * 1e3:.2f} mm passed the limit {limits['stroke_m'] * 1e3:.2f} mm"
+        elif power > limits[f"{name}_power_w"]:
+            self.tripped = f"{name} power {power:.1f} W passed the limit {limits[f'{name}_power_w']:.1f} W"
+
+    def _packed(self, frequency_hz: float) -> Array:
+        """Gains at a frequency in the kernel's units."""
+        g = self.schedule.at(frequency_hz)
+        dt, k = 1.0 / self.programme.sample_rate_hz, self._coil.force_constant_n_a
+        return np.array([
+            g.alpha_kg / k, g.beta_ns_m / k, g.gamma_n_m / k,
+            math.tan(math.pi * g.low_pass_hz * dt), math.tan(math.pi * g.high_pass_hz * dt),
+        ])  # fmt: skip
+
+    def _model(self, frequency_hz: float) -> LinearModel:
+        return linear_model(self._plant, frequency_hz=frequency_hz)
+
+    def _discretise(self, model: LinearModel) -> DiscreteModel:
+        # The converter holds the coil's reference; the shaker's amplifier smooths its drive.
+        holds = ["foh" if j == self._shaker_input else "zoh" for j in range(len(self._inputs))]
+        return discretise(model, self.programme.sample_rate_hz, holds)  # type: ignore[arg-type]
+
+    def _kick(self, model: LinearModel) -> Array:
+        """State change per newton held over one sample on the primary body."""
+        row = model.states.index(f"v_{self._plant.primary.name}")
+        kick = np.zeros(len(model.states))
+        dt = 1.0 / self.programme.sample_rate_hz
+        kick[row] = dt / self._plant.primary.mass_kg
+        # Second order in dt is enough: the force is white, its exact path within 20 µs is immaterial.
+        kick[model.states.index(f"x_{self._plant.primary.name}")] = 0.5 * dt * kick[row]
+        return kick
+
+    def _shaker_voltage(self, first: int, n: int) -> Array:
+        sweep = self.programme.sweep
+        t = (first + np.arange(n)) / self.programme.sample_rate_hz
+        rate = (sweep.to_hz - sweep.from_hz) / sweep.duration_s
+        return np.asarray(sweep.amplitude_v * np.sin(2.0 * np.pi * (sweep.from_hz + 0.5 * rate * t) * t))
+
+
+def _relative_acceleration(programme: Programme, coil: VoiceCoil) -> Array:
+    """Weights that form primary minus absorber acceleration from the sensors."""
+    plant = programme.plant
+    first, second = coil.between or ("", "")
+    pick = np.zeros(len(plant.sensor))
+    wanted = {second: -1.0} if programme.measurement == "absolute" else {first: 1.0, second: -1.0}
+    for body, weight in wanted.items():
+        found = [i for i, s in enumerate(plant.sensor) if s.kind == "acceleration" and s.of == body]
+        if not found:
+            raise ValueError(f"the control law needs an accelerometer on body '{body}'")
+        pick[found[0]] = weight
+    return pick
