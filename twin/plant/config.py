@@ -185,7 +185,10 @@ class Sensor(Frozen):
 
 
 class FittedOn(Frozen):
-    """Where a plant's parameters came from: rows of a recording that are no fair test of it any more."""
+    """Where a plant's parameters came from: rows of a recording that are no fair test of it any more.
+
+    Rows count from 0; ``last_row`` is the first one that was not used.
+    """
 
     recording: str
     first_row: int = Field(ge=0)
