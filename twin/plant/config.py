@@ -18,7 +18,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 # Where a channel lies in foreign recordings: array, array:unit or array[:,2]:unit.
-RecordedAs = Annotated[str, Field(pattern=r"^[^\[\]:]+(\[[^\[\]]*\])?(:[^:]+)?$")]
+RecordedAs = Annotated[str, Field(pattern=r"^[^\[\]:]+(\[[^\[\]]*\])?\s*(:[^:]+)?$")]
 
 MOTION_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 SENSOR_UNITS = MOTION_UNITS | {"current": "A", "voltage": "V", "force": "N"}

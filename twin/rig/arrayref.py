@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
 
-_FORM = re.compile(r"^(?P<array>[^\[\]:]+)(?P<index>\[[^\[\]]*\])?(?::(?P<unit>[^:]+))?$")
+_FORM = re.compile(r"^(?P<array>[^\[\]:]+)(?P<index>\[[^\[\]]*\])?\s*(?::(?P<unit>[^:]+))?$")
 _PART = re.compile(r"^(:|[+-]?\d{1,9})$")
 
 

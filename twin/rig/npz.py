@@ -219,7 +219,8 @@ def _why(path: Path, error: BaseException) -> str:
     if isinstance(error, PermissionError):
         return "may not be read (permission denied); check its owner and mode"
     try:
-        start = path.open("rb").read(6)
+        with path.open("rb") as file:
+            start = file.read(6)
     except OSError:
         return f"cannot be read ({error}); check the path"
     if not start:
