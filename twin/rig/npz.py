@@ -2,6 +2,9 @@
 
 import io
 import math
+import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -23,7 +26,7 @@ Array = NDArray[np.float64]
 
 _UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, TypeError, SyntaxError, ArithmeticError, MemoryError,
-    RuntimeError, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
+    RuntimeError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
 )  # fmt: skip
 
 
@@ -201,7 +204,10 @@ class _Archive:
             with zipfile.ZipFile(self.path) as archive:
                 # The whole member is read first, so that its checksum is compared before anything is used.
                 content = io.BytesIO(archive.read(self._members[name]))
-            array: NDArray[np.generic] = np.lib.format.read_array(content, allow_pickle=False)
+            with warnings.catch_warnings(
+                action="ignore"
+            ):  # headers written by Python 2 are read all the same
+                array: NDArray[np.generic] = np.lib.format.read_array(content, allow_pickle=False)
         except _UNREADABLE as error:
             if "allow_pickle" in str(error) or "Object arrays" in str(error):
                 raise InputError(
@@ -209,7 +215,8 @@ class _Archive:
                     "save it as an array of numbers"
                 ) from error
             raise InputError(
-                f"{self.path}: array '{name}' is damaged ({error}); copy or export the recording again"
+                f"{self.path}: array '{name}' is damaged ({error or type(error).__name__}); "
+                "copy or export the recording again"
             ) from error
         return array
 
