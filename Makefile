@@ -15,7 +15,10 @@ export OPENBLAS_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 export VECLIB_MAXIMUM_THREADS ?= 1
 export UV_PYTHON_DOWNLOADS := never
-unexport PYTHONPATH PYTHONHOME  # another environment's packages must not leak in
+# The system's certificates, for networks that have certificates of their own.
+export UV_SYSTEM_CERTS ?= 1
+# Another environment's packages must not leak in.
+unexport PYTHONPATH PYTHONHOME
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
