@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 GROUND = "ground"
 
@@ -51,6 +51,17 @@ class DampingTable(Frozen):
         return float(np.interp(frequency_hz, self.frequency_hz, self.ns_m))
 
 
+def _number_or_table(value: Any) -> str:
+    return "table" if isinstance(value, dict | DampingTable) else "number"
+
+
+# Told apart by form, so that a mistake is explained for the form that was meant.
+Damping = Annotated[
+    Annotated[NonNegative, Tag("number")] | Annotated[DampingTable, Tag("table")],
+    Discriminator(_number_or_table),
+]
+
+
 class Body(Frozen):
     """A rigid mass on a spring and a damper to the body (or the ground) it is attached to.
 
@@ -62,7 +73,7 @@ class Body(Frozen):
     mass_kg: Positive
     attached_to: str
     stiffness_n_m: Positive
-    damping_ns_m: NonNegative | DampingTable
+    damping_ns_m: Damping
     disturbance_density_n: NonNegative | None = None
 
     def damping_at(self, frequency_hz: float | None) -> float:
@@ -161,15 +172,25 @@ class ForceActuator(_Actuator):
 Actuator = Annotated[VoiceCoil | Shaker | ForceActuator, Field(discriminator="kind")]
 
 
+def _one_or_pair(value: Any) -> str:
+    return "pair" if isinstance(value, list | tuple) else "one"
+
+
+OneOrPair = Annotated[
+    Annotated[str, Tag("one")] | Annotated[tuple[str, str], Tag("pair")], Discriminator(_one_or_pair)
+]
+
+
 class Sensor(Frozen):
     """A measured channel. ``noise_density`` is one-sided, in the sensor's SI unit per sqrt(Hz).
 
+    A motion ``of`` two bodies is that of the first against the second.
     ``recorded_as`` names it in foreign recordings: ``"y:mm"`` for an array y in mm.
     """
 
     name: Name
     kind: Literal["displacement", "velocity", "acceleration", "current", "voltage", "force"]
-    of: str | tuple[str, str]
+    of: OneOrPair
     noise_density: Positive
     range: Positive | None = None
     recorded_as: RecordedAs | None = None
@@ -194,6 +215,12 @@ class FittedOn(Frozen):
     first_row: int = Field(ge=0)
     last_row: int = Field(gt=0)
 
+    @model_validator(mode="after")
+    def _holds_rows(self) -> Self:
+        if self.last_row <= self.first_row:
+            raise ValueError(f"last_row {self.last_row} must be after first_row {self.first_row}")
+        return self
+
 
 class Plant(Frozen):
     """A whole plant. Bodies keep the order of the file; the first is the primary one."""
@@ -211,10 +238,10 @@ class Plant(Frozen):
         _check_unique([a.name for a in self.actuator] + [s.name for s in self.sensor], "actuator or sensor")
         bodies = {b.name for b in self.body}
         if GROUND in bodies:
-            raise ValueError(f"no body may be called '{GROUND}': it is what the first one is attached to")
+            raise ValueError(f"no body may be called '{GROUND}': it is what stands still")
         _check_attachments({b.name: b.attached_to for b in self.body})
         for actuator in self.actuator:
-            _check_pushes(actuator, bodies)
+            _check_pushes(actuator, bodies, self.body[0].name)
         for sensor in self.sensor:
             _check_sensor(sensor, bodies, {a.name: a for a in self.actuator})
         known = set(self.limit_units)
@@ -252,8 +279,9 @@ class Plant(Frozen):
     def absorber(self) -> Body | None:
         """The body the voice coil pushes; without a coil, the first one attached to the primary."""
         coil = self.voice_coil
-        if coil is not None and coil.between is not None:
-            return self.find_body(coil.between[1])
+        pushed = None if coil is None else coil.pushes[-1][0]
+        if pushed is not None and pushed != self.primary.name:
+            return self.find_body(pushed)
         return next((b for b in self.body if b.attached_to == self.primary.name), None)
 
     def find_body(self, name: str) -> Body:
@@ -265,7 +293,8 @@ class Plant(Frozen):
         return _named(self.actuator, name)
 
     def with_damping(self, body: str, damping: float | DampingTable) -> "Plant":
-        """Return a copy in which one body's damping [Ns/m] is replaced."""
+        """Return a copy in which one body's damping [Ns/m] is replaced; KeyError if there is no such body."""
+        self.find_body(body)
         bodies = tuple(
             b.model_copy(update={"damping_ns_m": damping}) if b.name == body else b for b in self.body
         )
@@ -301,7 +330,9 @@ def _named(things: tuple[T, ...], name: str) -> T:
 def _check_unique(names: list[str], what: str) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"two things are called '{name}'; every {what} needs a name of its own")
+            raise ValueError(
+                f"two things are called '{name}'; every {what} needs a name of its own: rename one"
+            )
 
 
 def _check_attachments(attached_to: dict[str, str]) -> None:
@@ -317,20 +348,27 @@ def _check_attachments(attached_to: dict[str, str]) -> None:
             if parent in trail:
                 ring = " -> ".join([*trail, parent])
                 raise ValueError(
-                    f"body '{name}': attached_to runs in a loop ({ring}); one must reach \"{GROUND}\""
+                    f"body '{name}': attached_to runs in a loop ({ring}); attach one of them to \"{GROUND}\""
                 )
             trail.append(parent)
 
 
-def _check_pushes(actuator: _Actuator, bodies: set[str]) -> None:
+def _check_pushes(actuator: _Actuator, bodies: set[str], primary: str) -> None:
     places = [name for name, _ in actuator.pushes]
     for place in places:
         if place != GROUND and place not in bodies:
             raise ValueError(
                 f"actuator '{actuator.name}': '{place}' names no body; known: {', '.join(sorted(bodies))}"
             )
-    if len(set(places)) < len(places) or set(places) == {GROUND}:
-        raise ValueError(f"actuator '{actuator.name}': it must push a body against something else")
+    if places == [GROUND]:
+        raise ValueError(f"actuator '{actuator.name}': on = \"{GROUND}\" moves nothing; name a body")
+    if len(set(places)) < len(places):
+        raise ValueError(f"actuator '{actuator.name}': between must name two different places, at least one a body")
+    if isinstance(actuator, VoiceCoil) and places[1:] in ([GROUND], [primary]) and places[0] != GROUND:
+        raise ValueError(
+            f"actuator '{actuator.name}': between ends in '{places[1]}'; "
+            "a voice coil's second body is the absorber it pushes, the first what it stands on"
+        )
 
 
 def _check_sensor(sensor: Sensor, bodies: set[str], actuators: dict[str, Any]) -> None:
@@ -347,6 +385,10 @@ def _check_sensor(sensor: Sensor, bodies: set[str], actuators: dict[str, Any]) -
                 f"sensor '{sensor.name}': of = \"{name}\" names no {what}; "
                 f"known: {', '.join(sorted(known)) or 'none'}"
             )
+    if len(set(names)) < len(names):
+        raise ValueError(
+            f"sensor '{sensor.name}': of names '{names[0]}' twice; it needs two different bodies"
+        )
     if sensor.kind in ("current", "voltage") and isinstance(actuators[names[0]], ForceActuator):
         raise ValueError(f"sensor '{sensor.name}': a force actuator has no {sensor.kind}")
     if sensor.kind == "voltage" and getattr(actuators[names[0]], "drive", "voltage") == "current":
