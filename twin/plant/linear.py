@@ -37,7 +37,7 @@ class LinearModel:
     inputs
         Actuator names; the unit is the actuator's ``input_unit``.
     outputs
-        Sensor names.
+        Sensor names; a voltage whose circuit is left out of the model is not among them.
     """
 
     A: Array
@@ -89,7 +89,13 @@ def linear_model(
     ------
     ValueError
         If damping is given against frequency and neither a frequency nor a value replaces it.
+    KeyError
+        If a body in ``damping_ns_m`` or a coil in ``current_driven`` is not in the plant.
     """
+    for name in damping_ns_m or {}:
+        plant.find_body(name)
+    for name in current_driven:
+        plant.find_actuator(name)
     damping = dict(damping_ns_m or {})
     for body in plant.body:
         if body.name not in damping:
