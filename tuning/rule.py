@@ -29,7 +29,11 @@ def paired_low_pass_hz(excitation_hz: float, high_pass_hz: float) -> float:
 
 
 def scheduling_rule(
-    plant: Plant, frequency_hz: Sequence[float], *, high_pass_hz: float = 2.5, low_pass_hz: float | None = None
+    plant: Plant,
+    frequency_hz: Sequence[float],
+    *,
+    high_pass_hz: float = 2.5,
+    low_pass_hz: float | None = None,
 ) -> GainSchedule:
     """Gain schedule of thesis Test 3: gamma from eq. 6-5, beta = -c2, cutoffs paired (or a fixed low-pass).
 

@@ -1,0 +1,111 @@
+"""Gains of the rig's own law nearest to a wanted reference, with a modulus margin: a quadratic program (OSQP).
+
+    minimise |phi g - target|²   subject to   Re(e^{-j p_k} (1 + L_k g)) >= M   on a frequency grid
+
+The loop gain is linear in the gains, so each row is affine; a few rounds move the p_k to arg(1 + L_k).
+"""
+
+import numpy as np
+import osqp
+from scipy import sparse
+
+from twin.plant.errors import RunError
+from twin.plant.linear import Array, ComplexArray
+
+ROUNDS = 8
+PROXIMAL = 0.1
+REGULARITY = 1e-9
+RHO = 0.1
+
+
+class GainProgram:
+    """The quadratic program for one number of grid points; set up once, updated and warm-started after.
+
+    Parameters
+    ----------
+    rows
+        Grid points of the margin constraint.
+    scale
+        (3,) typical size of alpha, beta, gamma [kg, Ns/m, N/m]: what the solver sees is of order one.
+    bounds
+        (3, 2) lower and upper bound of each gain in SI units.
+    """
+
+    def __init__(self, rows: int, scale: Array, bounds: Array) -> None:
+        self._rows, self._scale = rows, scale
+        self._bounds = bounds / scale[:, None]
+        self._solver: osqp.OSQP | None = None
+
+    def solve(
+        self, fit: ComplexArray, target: complex, terms: ComplexArray, modulus_margin: float, start: Array
+    ) -> Array:
+        """Gains (alpha, beta, gamma) in SI units.
+
+        Parameters
+        ----------
+        fit
+            (3,) reference [A] per unit of each gain in closed loop at the wanted motion.
+        target
+            The wanted reference [A].
+        terms
+            (rows, 3) loop gain per unit of each gain.
+        modulus_margin
+            Least |1 + L| on the grid.
+        start
+            (3,) gains whose loop phases the first round linearises about, in SI units.
+
+        Raises
+        ------
+        RunError
+            If the solver finds no gains with that margin.
+        """
+        phi = fit * self._scale / abs(target)
+        wanted = target / abs(target)
+        scaled = terms * self._scale
+        # The three terms are nearly parallel around one frequency, which first-order solvers crawl on: solve in
+        # coordinates in which the rows of fit and loop together are orthonormal.
+        gram = len(scaled) * (phi.conj()[:, None] * phi).real + (scaled.conj().T @ scaled).real
+        basis = np.linalg.inv(np.linalg.cholesky(gram / len(scaled) + REGULARITY * np.eye(3))).T
+        phi, scaled = phi @ basis, scaled @ basis
+        stacked = np.vstack([phi.real, phi.imag])
+        # Two equations, three gains: a proximal term picks the solution nearest to the last round's and fades
+        # as the rounds converge, where a ridge would bias the fit.
+        hessian = 2.0 * (stacked.T @ stacked + PROXIMAL * np.eye(3))
+        pull = -2.0 * stacked.T @ np.array([wanted.real, wanted.imag])
+        y = np.linalg.solve(basis, start / self._scale)
+        for _ in range(ROUNDS):
+            one_plus = 1.0 + scaled @ y
+            turn = np.exp(-1j * np.angle(one_plus))
+            matrix = np.vstack([(turn[:, None] * scaled).real, basis])
+            lower = np.concatenate([modulus_margin - turn.real, self._bounds[:, 0]])
+            upper = np.concatenate([np.full(self._rows, np.inf), self._bounds[:, 1]])
+            linear = pull - 2.0 * PROXIMAL * y
+            previous, y = y, self._step(hessian, linear, matrix, lower, upper, y)
+            if np.max(np.abs(y - previous)) < 1e-4:
+                break
+        return np.asarray(basis @ y * self._scale)
+
+    def _step(
+        self, hessian: Array, linear: Array, matrix: Array, lower: Array, upper: Array, warm: Array
+    ) -> Array:
+        P = sparse.csc_matrix(np.triu(np.ones((3, 3))))
+        A = sparse.csc_matrix(np.ones(matrix.shape))
+        # Dense patterns written out in full, so that a zero today does not change the structure tomorrow.
+        P.data = np.concatenate([hessian[: j + 1, j] for j in range(3)])
+        A.data = matrix.T.ravel()
+        if self._solver is None:
+            self._solver = osqp.OSQP()
+            self._solver.setup(
+                P, linear, A, lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=4_000,
+                rho=RHO, adaptive_rho=False,  # adapted by the clock it would not be repeatable
+            )  # fmt: skip
+        else:
+            self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
+        self._solver.warm_start(x=warm)
+        result = self._solver.solve(raise_error=False)
+        if result.info.status_val not in (
+            osqp.SolverStatus.OSQP_SOLVED,
+            osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
+        ):
+            raise RunError(f"no gains keep the margin ({result.info.status})")
+        return np.asarray(result.x, dtype=np.float64)
