@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import lsim
 
 from twin.plant.config import Actuator, Body, DampingTable, ForceActuator, Plant, Sensor, Shaker, VoiceCoil
+from twin.plant.discrete import Hold, discretise
 from twin.plant.files import load_plant, preset_names
 from twin.plant.linear import LinearModel, frequency_response, linear_model, natural_frequencies_hz
 
@@ -97,46 +98,27 @@ def test_frequency_response_is_that_of_python_control(name: str) -> None:
     np.testing.assert_allclose(model.response(SWEEP_HZ), theirs, rtol=1e-7, atol=1e-14 * np.abs(theirs).max())
 
 
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize("name", ["rig", "engine_vcm"])
-def test_response_in_time_is_that_of_python_control_and_scipy(name: str) -> None:
+def test_stepped_response_is_that_of_python_control_and_scipy(name: str, hold: Hold) -> None:
     model = linear_model(load_plant(name))
     t = np.arange(0.0, 0.2, 2e-5)
     u = np.random.default_rng(4).normal(size=(len(t), len(model.inputs)))
-    by_control = control.forced_response(control.ss(model.A, model.B, model.C, model.D), t, u.T).outputs.T
-    _, by_scipy, _ = lsim((model.A, model.B, model.C, model.D), u, t, interp=True)
-    x, ours = np.zeros(len(model.A)), []
-    F, hold, ramp = _first_order_hold(model, t[1])
+    u[0] = 0.0
+    steps, x, outputs = discretise(model, 50_000.0, [hold] * len(model.inputs)), np.zeros(len(model.A)), []
     for before, now in zip(np.vstack([u[:1], u[:-1]]), u, strict=True):
-        if ours:
-            x = F @ x + hold @ before + ramp @ (now - before)
-        ours.append(model.C @ x + model.D @ now)
+        x = steps.F @ x + steps.B0 @ before + steps.B1 @ now
+        outputs.append(steps.C @ x + steps.D @ now)
+    ours = np.array(outputs)
     scale = np.abs(ours).max(axis=0)
-    np.testing.assert_allclose(np.array(ours) / scale, by_control / scale, atol=1e-9)
-    np.testing.assert_allclose(np.array(ours) / scale, by_scipy / scale, atol=1e-9)
-
-
-def _first_order_hold(model: LinearModel, dt: float) -> tuple[Array, Array, Array]:
-    """Transition and input matrices by power series, which neither library uses."""
-    n = len(model.A)
-    steps = 64
-    h = dt / steps
-    one, F, hold = np.eye(n), np.eye(n), np.zeros((n, n))
-    term = np.eye(n)
-    first = np.zeros((n, n))
-    small = np.zeros((n, n))
-    for order in range(1, 12):
-        hold += term * h / order  # integral of e^(A s) over the small step
-        first += term * h**2 / (order * (order + 1))
-        term = term @ model.A * h / order
-        small += term
-    one_step = one + small
-    total_hold, total_ramp = np.zeros((n, n)), np.zeros((n, n))
-    for k in range(steps):
-        # input 1 held, and input rising from k/steps to (k+1)/steps
-        total_hold = one_step @ total_hold + hold
-        total_ramp = one_step @ total_ramp + hold * (k / steps) + first / h / steps
-        F = one_step @ F
-    return F, total_hold @ model.B, total_ramp @ model.B
+    _, by_scipy, _ = lsim((model.A, model.B, model.C, model.D), u, t, interp=hold == "foh")
+    np.testing.assert_allclose(ours / scale, by_scipy / scale, atol=1e-9)
+    system = control.ss(model.A, model.B, model.C, model.D)
+    if hold == "foh":
+        by_control = control.forced_response(system, t, u.T).outputs.T
+    else:
+        by_control = control.forced_response(control.sample_system(system, 2e-5), t, u.T).outputs.T
+    np.testing.assert_allclose(ours / scale, by_control / scale, atol=1e-9)
 
 
 bodies = st.integers(1, 7)
