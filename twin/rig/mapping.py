@@ -11,6 +11,7 @@ from twin.rig.sidecar import NOT_RECORDED, Sidecar
 from twin.rig.units import to_si, units_for
 
 TIME_NAMES = ("t", "time")
+BY_PLANT = "the plant's recorded_as"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +114,7 @@ def map_channels(
         elif (text := recorded_as[name]) and (
             ref := parse_array_ref(text, f"'{name}' recorded_as")
         ).array in arrays:
-            found[name] = (ref, "the plant's recorded_as")
+            found[name] = (ref, BY_PLANT)
         elif name in arrays:
             found[name] = (ArrayRef(name), "equal names")
         else:
@@ -195,7 +196,7 @@ def _with_unit(
         )
     stated = beside.units.get(ref.array)
     # The sidecar was written for this recording, the plant's recorded_as for all of them.
-    unit = stated if ref.unit is None or (stated and decided == "the plant's recorded_as") else ref.unit
+    unit = stated if ref.unit is None or (stated and decided == BY_PLANT) else ref.unit
     if unit is None:
         return ChannelMapping(name, ref, si_unit, si_unit, 1.0, f"{decided}; no unit stated, taken as SI")
     known = to_si(unit)

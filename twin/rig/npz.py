@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
+from twin.plant.linear import Array, read_only
 from twin.rig.arrayref import ArrayRef
 from twin.rig.mapping import TIME_NAMES, ChannelMapping, map_channels
 from twin.rig.sidecar import Sidecar, find_sidecar
 from twin.rig.timebase import sample_rate
-
-Array = NDArray[np.float64]
 
 _UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, TypeError, SyntaxError, ArithmeticError, MemoryError,
@@ -30,7 +29,7 @@ _UNREADABLE = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class NpzRecording:
     """A recording, checked and ready to be read block by block.
 
@@ -50,6 +49,10 @@ class NpzRecording:
         What a person should know before trusting it, one sentence each.
     block_s
         Length of a block [s]; the last one may be shorter.
+    values
+        (n_samples, n_channels) in SI units, read-only, as recorded: not finite where samples are missing.
+    ranges
+        (n_channels,) largest magnitude each channel can measure, infinity where unknown.
     """
 
     path: Path
@@ -141,8 +144,8 @@ def open_npz(
         mapping=mapping,
         notes=(rate_note, *notes, *beside.notes),
         block_s=block_s,
-        values=np.column_stack(columns),
-        ranges=np.array([limits.get(entry.channel) or np.inf for entry in mapping]),
+        values=read_only(np.column_stack(columns)),
+        ranges=read_only([limits.get(entry.channel) or np.inf for entry in mapping]),
     )
 
 
