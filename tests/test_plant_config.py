@@ -61,7 +61,7 @@ def told(text: str) -> str:
     return "\n".join(line.removeprefix("rig.toml: ") for line in lines)
 
 
-# --- presets against seed tables ------------------------------------------------------------------------
+# --- presets against the thesis's tables ------------------------------------------------------------------------
 
 
 # m1, m2, c1, c2, k1, k2 (thesis Tables 5-1/6-1, 8-2, 8-3, 7-1, 7-3, 4-2)
