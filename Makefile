@@ -67,7 +67,7 @@ lock: $(VENV)/.uv ## Write requirements/*.txt anew from pyproject.toml (ARGS=--u
 
 clean: ## Remove the environment and all caches; recordings stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache dist
-	find twin estimators tuning tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
+	find . -name __pycache__ -prune -exec rm -rf {} +
 
 # An environment remembers where it was made, so a checkout that was moved or copied needs a new one.
 ifneq ($(shell cat $(VENV)/.python 2>/dev/null),$(CURDIR))
