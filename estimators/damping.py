@@ -171,6 +171,10 @@ class DampingLearner:
         self._in_use += np.clip(wanted - self._in_use, -step, step)
         return self.curve()
 
+    def warm_up(self) -> None:
+        """Compile what a block needs, on copies."""
+        scalar_update(self._mean.copy(), self._covariance.copy(), np.zeros(len(self._mean)), 1.0, 0.0)
+
     def curve(self) -> DampingCurve:
         """Copy of what is known at present."""
         variance = np.maximum(np.diag(self._covariance), 0.0)

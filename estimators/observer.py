@@ -17,7 +17,8 @@ from estimators.kernels import constant_gain_block, full_covariance_block
 from estimators.types import StateEstimate
 from twin.plant.blocks import Block
 from twin.plant.config import Plant
-from twin.plant.inputs import InputSource, choose_inputs, driven_model, gather, input_columns
+from twin.plant.discrete import DiscreteModel
+from twin.plant.inputs import DriveReader, InputSource, choose_inputs, driven_model
 from twin.plant.linear import Array, LinearModel, read_only
 
 OBSERVED_KINDS = ("displacement", "velocity", "acceleration", "current")
@@ -95,29 +96,27 @@ class Observer:
         self._disturbances = disturbances or Disturbances()
         self._settle_samples = settle_samples
         self._sensor_columns = [list(channels).index(name) for name in self.sensors]
-        self._input_columns = input_columns(self.sources, list(channels))
+        self._drive = DriveReader(self.sources, channels)
         self._u_before: Array | None = None
         self._full_left = 0
 
-        model = self._linear(plant, frequency_hz)
+        model, discrete = driven_model(plant, self.sources, sample_rate_hz, frequency_hz)
         n, m, p = len(model.states), len(self.sources), len(chosen)
         self.states = model.states
         self.filter = KalmanFilter(dim_x=n, dim_z=p, dim_u=2 * m)
-        self._first = True
-        self.set_model(plant, frequency_hz)
+        self.set_model(plant, model, discrete)
         self.filter.x = np.zeros((n, 1))
         self.filter.P = self.steady_covariance.copy()
         self._full_left = 0
 
-    def set_model(self, plant: Plant, frequency_hz: float | None) -> None:
+    def set_model(self, plant: Plant, model: LinearModel, discrete: DiscreteModel) -> None:
         """Put another model of the same structure in place; state and covariance are carried over.
 
         Parameters
         ----------
-        frequency_hz
-            Where damping against frequency is read [Hz].
+        plant, model, discrete
+            The plant and its `twin.plant.inputs.driven_model` by this observer's ``sources``.
         """
-        model, discrete = driven_model(plant, self.sources, self.sample_rate_hz, frequency_hz)
         rows = [model.outputs.index(name) for name in self.sensors]
         kf = self.filter
         kf.F = discrete.F.copy()
@@ -144,7 +143,7 @@ class Observer:
         kf = self.filter
         z = np.ascontiguousarray(block.values[:, self._sensor_columns])
         valid = np.ascontiguousarray(block.valid[:, self._sensor_columns])
-        u = self._inputs(block)
+        u = self._drive.gather(block)
         if self._u_before is None:
             self._u_before = u[0].copy()
         x, P = kf.x[:, 0].copy(), np.ascontiguousarray(kf.P, dtype=np.float64)
@@ -181,18 +180,6 @@ class Observer:
             sensors=self.sensors,
         )
 
-    def _inputs(self, block: Block) -> Array:
-        u = gather(block.values, self._input_columns)
-        for j, column in enumerate(self._input_columns):
-            if column >= 0 and not block.valid[:, column].all():
-                hold_last_valid(
-                    u[:, j], block.valid[:, column], 0.0 if self._u_before is None else self._u_before[j]
-                )
-        return u
-
-    def _linear(self, plant: Plant, frequency_hz: float | None) -> LinearModel:
-        return driven_model(plant, self.sources, self.sample_rate_hz, frequency_hz)[0]
-
     def _process_noise(self, plant: Plant, model: LinearModel, B0: Array, B1: Array) -> Array:
         """Process noise over one sample: white forces and voltages by Van Loan, and the noise of measured inputs."""
         n = len(model.states)
@@ -225,9 +212,3 @@ def van_loan(A: Array, intensity: Array, dt: float) -> Array:
     phi = expm(big)
     Q = phi[n:, n:].T @ phi[:n, n:]
     return np.asarray(0.5 * (Q + Q.T))
-
-
-def hold_last_valid(signal: Array, valid: np.ndarray, before: float) -> None:
-    """Repeat the last valid sample over invalid ones, in place; ``before`` stands for the sample before."""
-    last = np.maximum.accumulate(np.where(valid, np.arange(len(signal)), -1))
-    signal[:] = np.where(last >= 0, signal[last], before)

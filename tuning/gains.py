@@ -7,6 +7,7 @@ The loop gain is linear in the gains, so each row is affine; a few rounds move t
 
 import numpy as np
 import osqp
+from numpy.typing import NDArray
 from scipy import sparse
 
 from twin.plant.errors import RunError
@@ -86,7 +87,13 @@ class GainProgram:
         return np.asarray(basis @ y * self._scale)
 
     def _step(
-        self, hessian: Array, linear: Array, matrix: Array, lower: Array, upper: Array, warm: Array
+        self,
+        hessian: Array,
+        linear: Array,
+        matrix: Array,
+        lower: NDArray[np.floating],
+        upper: Array,
+        warm: Array,
     ) -> Array:
         P = sparse.csc_matrix(np.triu(np.ones((3, 3))))
         A = sparse.csc_matrix(np.ones(matrix.shape))

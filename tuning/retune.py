@@ -20,6 +20,11 @@ from twin.plant.errors import InputError, RunError
 from twin.plant.linear import ComplexArray, natural_frequencies_hz
 
 
+SAME_DAMPING_NS_M = 0.03
+SAME_AMPLITUDE = 5e-3
+"""A point is not solved again for changes smaller than these: gains would move by less than a thousandth."""
+
+
 @dataclass(frozen=True, slots=True)
 class TuningGoal:
     """What the operator asks of the tuner.
@@ -61,6 +66,36 @@ class Prediction:
     powers: Powers
 
 
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """What the answer for one point of the table depends on."""
+
+    frequency_hz: float
+    damping_ns_m: float
+    damping_std_ns_m: float
+    amplitude: float
+    cutoffs_hz: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """A verified point and the question it answers."""
+
+    question: _Question
+    point: OperatingPoint
+
+    def answers(self, new: _Question) -> bool:
+        """Whether the new question differs by less than would change the answer noticeably."""
+        old = self.question
+        return (
+            new.frequency_hz == old.frequency_hz
+            and new.cutoffs_hz == old.cutoffs_hz
+            and abs(new.damping_ns_m - old.damping_ns_m) <= SAME_DAMPING_NS_M
+            and new.damping_std_ns_m <= old.damping_std_ns_m + SAME_DAMPING_NS_M
+            and abs(new.amplitude / old.amplitude - 1.0) <= SAME_AMPLITUDE
+        )
+
+
 class Retuner:
     """Propose gains for the points of a schedule's table.
 
@@ -100,13 +135,14 @@ class Retuner:
         self._limits = CoilLimits(power, plant.limits[current], plant.limits["stroke_m"], coil.resistance_ohm)
         self._limit = LimitProblem()
         modes = natural_frequencies_hz(plant)
-        self._design_grid = margin_grid(facts.sample_rate_hz, modes, 50)
-        self._check_grid = margin_grid(facts.sample_rate_hz, modes, 250)
+        self._check_grid = margin_grid(facts.sample_rate_hz, modes, 200)
+        self._design_rows = slice(None, None, 4)
         w2 = math.sqrt(absorber.stiffness_n_m / absorber.mass_kg)
         scale = np.array([absorber.mass_kg, absorber.mass_kg * w2, absorber.stiffness_n_m])
         # gamma > -k2, alpha > -m2, beta free (thesis 6.2.3), with room to the bounds.
         bounds = np.array([[-0.5, 1.0], [-1.0, 1.0], [-0.8, 2.0]]) * scale[:, None]
-        self._program = GainProgram(len(self._design_grid), scale, bounds)
+        self._program = GainProgram(len(self._check_grid[self._design_rows]), scale, bounds)
+        self._solved: dict[int, _Solved] = {}
 
     def propose(
         self,
@@ -157,6 +193,20 @@ class Retuner:
             points=tuple(points),
         )
 
+    @staticmethod
+    def _question(
+        plant: Plant, damping_std: float, frequency: float, amplitude: float, schedule: GainSchedule
+    ) -> "_Question":
+        absorber = plant.absorber
+        gains = schedule.at(frequency)
+        return _Question(
+            frequency_hz=frequency,
+            damping_ns_m=absorber.damping_at(frequency) if absorber is not None else 0.0,
+            damping_std_ns_m=damping_std,
+            amplitude=amplitude,
+            cutoffs_hz=(gains.low_pass_hz, gains.high_pass_hz),
+        )
+
     def limit_at(self, plant: Plant, frequency_hz: float, amplitude: float) -> LimitResult:
         """Physical limit at one frequency; see `LimitProblem.solve`."""
         model = RigModel(plant, self.facts, frequency_hz)
@@ -173,10 +223,12 @@ class Retuner:
         damping = absorber.damping_at(frequency) if absorber is not None else 0.0
         model = RigModel(plant, self.facts, frequency)
         response = model.response(frequency)[0]
-        terms = model.loop_terms(self._design_grid, in_use.low_pass_hz, in_use.high_pass_hz)
+        cutoffs = in_use.low_pass_hz, in_use.high_pass_hz
         path = model.paths(frequency, in_use.low_pass_hz, in_use.high_pass_hz)[0]
         low, high = max(0.0, damping - 2.0 * damping_std), damping + 2.0 * damping_std
-        others = [RigModel(plant, self.facts, frequency, c) for c in (low, high)]
+        models = [model, *(RigModel(plant, self.facts, frequency, c) for c in (low, high))]
+        loops = [m.loop_terms(self._check_grid, *cutoffs) for m in models]
+        terms = loops[0][self._design_rows]
 
         limits, margin = self._limits, self.goal.modulus_margin
         best = self._solve_limit(response, amplitude, limits)
@@ -188,7 +240,7 @@ class Retuner:
             gains = replace(
                 in_use, alpha_kg=float(numbers[0]), beta_ns_m=float(numbers[1]), gamma_n_m=float(numbers[2])
             )
-            trouble, found = self._verify(model, others, gains, frequency, amplitude)
+            trouble, found = self._verify(models, loops, gains, frequency, amplitude)
             if not trouble:
                 prediction = predict(model, gains, frequency, amplitude)
                 return OperatingPoint(
@@ -216,25 +268,29 @@ class Retuner:
         raise RunError(trouble)
 
     def _verify(
-        self, model: RigModel, others: list[RigModel], gains: Gains, frequency: float, amplitude: float
+        self,
+        models: list[RigModel],
+        loops: list[ComplexArray],
+        gains: Gains,
+        frequency: float,
+        amplitude: float,
     ) -> tuple[str, Margins]:
         """What is wrong with these gains (empty: nothing), and the least margins found."""
         goal, least = self.goal, Margins(math.inf, None)
-        for candidate in (model, *others):
+        for candidate, terms in zip(models, loops, strict=True):
             decay = candidate.decay_rate_1_s(gains)
             if not decay < -goal.slowest_decay_1_s:
                 return (
                     f"slowest pole at {decay:+.2f} 1/s, wanted below -{goal.slowest_decay_1_s:g} 1/s",
                     least,
                 )
-            terms = candidate.loop_terms(self._check_grid, gains.low_pass_hz, gains.high_pass_hz)
             found = margins(terms, self._check_grid, gains)
             delay = min((d for d in (found.delay_s, least.delay_s) if d is not None), default=None)
             least = Margins(min(found.modulus, least.modulus), delay)
         if least.modulus < 0.95 * goal.modulus_margin:
             return f"modulus margin {least.modulus:.3f}, wanted {goal.modulus_margin:g}", least
         for f in (frequency - goal.drift_hz, frequency, frequency + goal.drift_hz):
-            p = predict(model, gains, f, amplitude)
+            p = predict(models[0], gains, f, amplitude)
             if p.powers.joule_mean_w > self._limits.joule_mean_w * 1.001:
                 return (
                     f"power {p.powers.joule_mean_w:.2f} W mean Joule at {f:.2f} Hz is over the budget",

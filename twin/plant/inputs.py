@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from twin.plant.blocks import Block
 from twin.plant.config import ForceActuator, Plant
 from twin.plant.discrete import DiscreteModel, Hold, discretise
 from twin.plant.linear import Array, LinearModel, linear_model
@@ -82,15 +83,29 @@ def driven_model(
     return model, discretise(model, sample_rate_hz, [s.hold for s in sources])
 
 
-def input_columns(sources: Sequence[InputSource], channels: Sequence[str]) -> tuple[int, ...]:
-    """Column of each input in a block with these channels; -1 where nothing is recorded."""
-    return tuple(channels.index(s.channel) if s.channel is not None else -1 for s in sources)
+class DriveReader:
+    """Read the actuators' inputs out of blocks.
 
+    A model must be driven by something: an input that is not recorded is zero, and one whose sample is invalid
+    keeps its last valid value, across blocks too.
+    """
 
-def gather(values: Array, columns: Sequence[int]) -> Array:
-    """Inputs (N, m) from a block's values (N, n_channels); zero where nothing is recorded."""
-    u = np.zeros((len(values), len(columns)))
-    for j, column in enumerate(columns):
-        if column >= 0:
-            u[:, j] = values[:, column]
-    return u
+    def __init__(self, sources: Sequence[InputSource], channels: Sequence[str]) -> None:
+        names = list(channels)
+        self._columns = [names.index(s.channel) if s.channel is not None else -1 for s in sources]
+        self._last = np.zeros(len(self._columns))
+
+    def gather(self, block: Block) -> Array:
+        """Inputs of a block, (n_samples, n_inputs) in the actuators' input units."""
+        u = np.zeros((block.n_samples, len(self._columns)))
+        for j, column in enumerate(self._columns):
+            if column < 0:
+                continue
+            u[:, j] = block.values[:, column]
+            valid = block.valid[:, column]
+            if not valid.all():
+                latest = np.maximum.accumulate(np.where(valid, np.arange(len(u)), -1))
+                u[:, j] = np.where(latest >= 0, u[latest, j], self._last[j])
+        if len(u):
+            self._last = u[-1].copy()
+        return u

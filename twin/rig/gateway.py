@@ -208,13 +208,14 @@ class EmbeddedRig:
         process = self._process
         if process is None:
             return
+        for farewell in (lambda: None, process.stdin.close if process.stdin else lambda: None, process.kill):
+            farewell()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=2.0)
+                break
         if process.stdin is not None:
-            process.stdin.close()
-        try:
-            process.wait(timeout=2.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            with contextlib.suppress(OSError):
+                process.stdin.close()
         if process.stdout is not None:
             process.stdout.close()
 
