@@ -102,7 +102,9 @@ class Observer:
 
         model, discrete = driven_model(plant, self.sources, sample_rate_hz, frequency_hz)
         n, m, p = len(model.states), len(self.sources), len(chosen)
-        self.states = model.states
+        self._drifting = [b for b in plant.body if b.disturbance_drift_n_s is not None]
+        self.states = (*model.states, *(f"d_{b.name}" for b in self._drifting))
+        n += len(self._drifting)
         self.filter = KalmanFilter(dim_x=n, dim_z=p, dim_u=2 * m)
         self.set_model(plant, model, discrete)
         self.filter.x = np.zeros((n, 1))
@@ -118,12 +120,15 @@ class Observer:
             The plant and its `twin.plant.inputs.driven_model` by this observer's ``sources``.
         """
         rows = [model.outputs.index(name) for name in self.sensors]
+        A, C = self._with_drift(plant, model, rows)
+        pad = ((0, len(self._drifting)), (0, 0))
+        B0, B1 = np.pad(discrete.B0, pad), np.pad(discrete.B1, pad)
         kf = self.filter
-        kf.F = discrete.F.copy()
-        kf.B = np.hstack([discrete.B0, discrete.B1])
-        kf.H = model.C[rows].copy()
+        kf.F = np.ascontiguousarray(expm(A / self.sample_rate_hz)) if self._drifting else discrete.F.copy()
+        kf.B = np.hstack([B0, B1])
+        kf.H = C
         kf.R = np.diag(self._variance)
-        kf.Q = self._process_noise(plant, model, discrete.B0, discrete.B1)
+        kf.Q = self._process_noise(plant, A, B0, B1)
         self.feedthrough = read_only(model.D[rows])
         prior, _, _ = dare(kf.F.T, kf.H.T, kf.Q, kf.R)
         prior = 0.5 * (prior + prior.T)
@@ -180,21 +185,35 @@ class Observer:
             sensors=self.sensors,
         )
 
-    def _process_noise(self, plant: Plant, model: LinearModel, B0: Array, B1: Array) -> Array:
+    def _with_drift(self, plant: Plant, model: LinearModel, rows: list[int]) -> tuple[Array, Array]:
+        """System and measurement matrix with the wandering forces as further states."""
+        n, extra = len(model.states), len(self._drifting)
+        A, C = np.pad(model.A, ((0, extra), (0, extra))), np.pad(model.C[rows], ((0, 0), (0, extra)))
+        for column, body in enumerate(self._drifting, start=n):
+            A[model.states.index(f"v_{body.name}"), column] = 1.0 / body.mass_kg
+            for row, name in enumerate(self.sensors):
+                sensor = next(s for s in plant.sensor if s.name == name)
+                bodies = (sensor.of,) if isinstance(sensor.of, str) else sensor.of
+                if sensor.kind == "acceleration" and body.name in bodies:
+                    C[row, column] = (1.0, -1.0)[bodies.index(body.name)] / body.mass_kg
+        return A, C
+
+    def _process_noise(self, plant: Plant, A: Array, B0: Array, B1: Array) -> Array:
         """Process noise over one sample: white forces and voltages by Van Loan, and the noise of measured inputs."""
-        n = len(model.states)
-        intensity = np.zeros((n, n))
-        for body in plant.body:
-            row = model.states.index(f"v_{body.name}")
-            density = body.disturbance_density_n
-            density = self._disturbances.force_n if density is None else density
-            intensity[row, row] = (density / body.mass_kg) ** 2 / 2.0
-        for row, state in enumerate(model.states):
-            if state.startswith("i_"):
-                coil = plant.find_actuator(state[2:])
-                inductance = getattr(coil, "inductance_h", None) or np.inf
+        intensity = np.zeros_like(A)
+        for row, state in enumerate(self.states):
+            kind, name = state.split("_", 1)
+            if kind == "v":
+                body = plant.find_body(name)
+                density = body.disturbance_density_n
+                density = self._disturbances.force_n if density is None else density
+                intensity[row, row] = (density / body.mass_kg) ** 2 / 2.0
+            elif kind == "d":
+                intensity[row, row] = (plant.find_body(name).disturbance_drift_n_s or 0.0) ** 2 / 2.0
+            elif kind == "i":
+                inductance = getattr(plant.find_actuator(name), "inductance_h", None) or np.inf
                 intensity[row, row] = (self._disturbances.voltage_v / inductance) ** 2 / 2.0
-        Q = van_loan(model.A, intensity, 1.0 / self.sample_rate_hz)
+        Q = van_loan(A, intensity, 1.0 / self.sample_rate_hz)
         for j, source in enumerate(self.sources):
             variance = source.noise_density**2 * self.sample_rate_hz / 2.0
             Q += variance * (np.outer(B0[:, j], B0[:, j]) + np.outer(B1[:, j], B1[:, j]))

@@ -66,7 +66,9 @@ class Body(Frozen):
     """A rigid mass on a spring and a damper to the body (or the ground) it is attached to.
 
     ``disturbance_density_n`` is the one-sided density [N/sqrt(Hz)] of the white force that an observer may
-    suppose to act on the body beside the known ones; None leaves it to the observer.
+    suppose to act on the body beside the known ones; None leaves it to the observer. ``disturbance_drift_n_s``
+    adds a force that wanders, with white rate of change of this one-sided density [N/s per sqrt(Hz)]: a hand, a
+    draught, a thermal load.
     """
 
     name: Name
@@ -75,6 +77,7 @@ class Body(Frozen):
     stiffness_n_m: Positive
     damping_ns_m: Damping
     disturbance_density_n: NonNegative | None = None
+    disturbance_drift_n_s: Positive | None = None
 
     def damping_at(self, frequency_hz: float | None) -> float:
         """Damping [Ns/m] at a frequency [Hz]; a plain number is the same at every frequency.
@@ -363,7 +366,9 @@ def _check_pushes(actuator: _Actuator, bodies: set[str], primary: str) -> None:
     if places == [GROUND]:
         raise ValueError(f"actuator '{actuator.name}': on = \"{GROUND}\" moves nothing; name a body")
     if len(set(places)) < len(places):
-        raise ValueError(f"actuator '{actuator.name}': between must name two different places, at least one a body")
+        raise ValueError(
+            f"actuator '{actuator.name}': between must name two different places, at least one a body"
+        )
     if isinstance(actuator, VoiceCoil) and places[1:] in ([GROUND], [primary]) and places[0] != GROUND:
         raise ValueError(
             f"actuator '{actuator.name}': between ends in '{places[1]}'; "
