@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 import warnings
 import weakref
@@ -24,6 +23,7 @@ from twin.plant.blocks import Block, Channel
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.recording import ACKNOWLEDGEMENTS, COMMANDS, FORMAT_VERSION, PROPERTY, ROOT
+from twin.rig.rerun_tool import rerun_environment, rerun_program
 
 _REPAIR_TIMEOUT_S = 600.0
 
@@ -166,10 +166,11 @@ def open_recording(path: Path) -> Recording:
 def _repair(path: Path, folder: Path) -> Path:
     """Copy all whole chunks of a damaged file to a new one, with Rerun's own tool."""
     whole = folder / "repaired.rrd"
-    command = [sys.executable, "-m", "rerun", "rrd", "filter", "--continue-on-error", str(path)]
-    command += ["-o", str(whole)]
+    command = [rerun_program(), "rrd", "filter", "--continue-on-error", str(path), "-o", str(whole)]
     try:
-        subprocess.run(command, capture_output=True, timeout=_REPAIR_TIMEOUT_S, check=False)
+        subprocess.run(
+            command, env=rerun_environment(), capture_output=True, timeout=_REPAIR_TIMEOUT_S, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(
             f"{path}: is cut short and could not be repaired ({error}); try: rerun rrd filter --continue-on-error"
