@@ -1,0 +1,58 @@
+"""Reading back the series a `RerunView` wrote, for summaries without Rerun's viewer."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
+
+from twin.plant.linear import Array
+
+_VALUES = {"Scalars:scalars": "SeriesLines:names", "Measurements:values": "Measurements:names"}
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One entity's curves: times (n,) [s], values (n, k), names (k,), standard deviations (n, k) or None."""
+
+    time_s: Array
+    values: Array
+    names: tuple[str, ...]
+    std: Array | None
+
+
+def read_series(path: Path) -> dict[str, Series]:
+    """Every scalar series and measurement in a recording, by entity path without its leading slash."""
+    rows: dict[tuple[str, str], list[tuple[Array, Array]]] = {}
+    names: dict[str, tuple[str, ...]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RerunWarning)
+        stream = RrdReader(path).stream()
+    for chunk in stream.drop(content="/record/**"):
+        batch, entity = chunk.to_record_batch(), chunk.entity_path.lstrip("/")
+        for column in batch.schema.names:
+            if column in _VALUES.values():
+                names[entity] = tuple(batch.column(column)[batch.num_rows - 1].as_py() or ())
+            elif (column in _VALUES or column == "Measurements:variances") and "time" in batch.schema.names:
+                values = np.asarray(batch.column(column).flatten(), dtype=np.float64)
+                time_s = np.asarray(batch.column("time").cast("int64")) * 1e-9
+                kind = "variance" if column == "Measurements:variances" else "value"
+                rows.setdefault((entity, kind), []).append((time_s, values.reshape(len(time_s), -1)))
+    found = {}
+    for (entity, kind), parts in rows.items():
+        if kind == "variance":
+            continue
+        time_s, values = _sorted(parts)
+        spread = rows.get((entity, "variance"))
+        std = None if spread is None else np.sqrt(_sorted(spread)[1])
+        labels = names.get(entity, ())
+        found[entity] = Series(time_s, values, labels or ("",) * values.shape[1], std)
+    return found
+
+
+def _sorted(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    time_s = np.concatenate([t for t, _ in parts])
+    order = np.argsort(time_s, kind="stable")
+    return time_s[order], np.concatenate([v for _, v in parts])[order]
