@@ -61,6 +61,11 @@ class GainSchedule(Frozen):
             raise ValueError("frequency_hz must rise from point to point [Hz]")
         if self.on_from_hz > self.on_to_hz:
             raise ValueError("on_from_hz must not be above on_to_hz [Hz]")
+        if self.on_from_hz < self.frequency_hz[0] or self.on_to_hz > self.frequency_hz[-1]:
+            raise ValueError(
+                f"the controller would act from {self.on_from_hz:g} to {self.on_to_hz:g} Hz but the table has gains "
+                f"from {self.frequency_hz[0]:g} to {self.frequency_hz[-1]:g} Hz; add points or narrow the band"
+            )
         return self
 
     def at(self, frequency_hz: float) -> Gains:
