@@ -92,7 +92,7 @@ class GainProgram:
         linear: Array,
         matrix: Array,
         lower: NDArray[np.floating],
-        upper: Array,
+        upper: NDArray[np.floating],
         warm: Array,
     ) -> Array:
         P = sparse.csc_matrix(np.triu(np.ones((3, 3))))

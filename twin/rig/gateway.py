@@ -18,7 +18,7 @@ from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import Plant
 from twin.plant.errors import RunError
-from twin.rig.programme import Programme
+from twin.rig.programme import Programme, rig_channels
 from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_client
 
 CONNECT_TIMEOUT_S = 60.0
@@ -166,7 +166,7 @@ class EmbeddedRig:
         self.programme = programme
         self._speed = speed
         self._process: subprocess.Popen[bytes] | None = None
-        self.gateway: RigGateway
+        self._gateway: RigGateway | None = None
 
     def __enter__(self) -> Self:
         rig_keys, station_keys = KeyPair.fresh(), KeyPair.fresh()
@@ -183,41 +183,69 @@ class EmbeddedRig:
             "station_public": station_keys.public.decode(),
             "speed": self._speed,
         }
-        if process.stdin is None or process.stdout is None:
+        if process.stdin is None:
             raise RunError("the rig's process has no pipes")
-        try:
+        with contextlib.suppress(BrokenPipeError):  # `connect` will find that it is gone
             process.stdin.write(json.dumps(order).encode() + b"\n")
             process.stdin.flush()
-            ports = json.loads(process.stdout.readline())
-        except (BrokenPipeError, json.JSONDecodeError) as error:
+        self._keys, self._rig_public = station_keys, rig_keys.public
+        return self
+
+    def connect(self) -> None:
+        """Wait for the rig to be ready and let it begin.
+
+        Raises
+        ------
+        RunError
+            If its process did not start.
+        """
+        process = self._process
+        try:
+            line = process.stdout.readline() if process is not None and process.stdout is not None else b""
+            ports = json.loads(line)
+        except json.JSONDecodeError as error:
             raise RunError("the rig's process did not start; its own message stands above") from error
-        self.gateway = RigGateway(
+        self._gateway = RigGateway(
             self.programme.plant,
             f"tcp://127.0.0.1:{ports['samples_port']}",
             f"tcp://127.0.0.1:{ports['commands_port']}",
-            station_keys,
-            rig_keys.public,
+            self._keys,
+            self._rig_public,
         )
-        self.gateway.connect(self.is_alive)
-        return self
+        self._gateway.connect(self.is_alive)
+
+    @property
+    def gateway(self) -> RigGateway:
+        """The connection; RunError before `connect`."""
+        if self._gateway is None:
+            raise RunError("the rig is not connected")
+        return self._gateway
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What its blocks will hold."""
+        return rig_channels(self.programme.plant)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.gateway.close()
+        if self._gateway is not None:
+            self._gateway.close()
         process = self._process
         if process is None:
             return
-        for farewell in (lambda: None, process.stdin.close if process.stdin else lambda: None, process.kill):
-            farewell()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=2.0)
-                break
-        if process.stdin is not None:
+        # Let it take its leave; a closed input tells it that nobody is left; then there is nothing to be said.
+        if not _ended(process):
             with contextlib.suppress(OSError):
-                process.stdin.close()
-        if process.stdout is not None:
-            process.stdout.close()
+                if process.stdin is not None:
+                    process.stdin.close()
+            if not _ended(process):
+                process.kill()
+                process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
 
     @property
     def pid(self) -> int:
@@ -231,3 +259,11 @@ class EmbeddedRig:
     def blocks(self) -> Iterator[Block]:
         """Blocks of the rig; see `RigGateway.blocks`."""
         return self.gateway.blocks(self.is_alive)
+
+
+def _ended(process: subprocess.Popen[bytes], within_s: float = 2.0) -> bool:
+    try:
+        process.wait(timeout=within_s)
+    except subprocess.TimeoutExpired:
+        return False
+    return True

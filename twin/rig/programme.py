@@ -5,6 +5,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from twin.control.schedule import GainSchedule
+from twin.plant.blocks import Channel
 from twin.plant.config import DampingTable, Frozen, NonNegative, Plant, Positive
 
 
@@ -75,3 +76,10 @@ class Programme(Frozen):
     def block_s(self) -> float:
         """Duration of a block [s]."""
         return self.block_samples / self.sample_rate_hz
+
+
+def rig_channels(plant: Plant) -> tuple[Channel, ...]:
+    """What a rig sends: its sensors, then the coil's current reference as the converter holds it."""
+    coil = plant.voice_coil
+    command = () if coil is None else (Channel(coil.name, coil.input_unit),)
+    return (*(Channel(s.name, s.unit) for s in plant.sensor), *command)

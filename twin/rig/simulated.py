@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from twin.control.chain import CHAIN_STATES, chain_step
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
-from twin.plant.blocks import Channel
 from twin.plant.compiled import kernel
 from twin.plant.config import Shaker, VoiceCoil
 from twin.plant.discrete import DiscreteModel, discretise
 from twin.plant.linear import Array, LinearModel, linear_model
-from twin.rig.programme import Programme
+from twin.rig.programme import Programme, rig_channels
 
 POWER_WINDOW_BLOCKS = 10
 
@@ -154,10 +153,7 @@ class SimulatedRig:
         self._plant, self._coil = plant, coil
         self._inputs = tuple(a.name for a in plant.actuator)
         self._coil_input, self._shaker_input = self._inputs.index(coil.name), self._inputs.index(shaker.name)
-        self.channels = (
-            *(Channel(s.name, s.unit) for s in plant.sensor),
-            Channel(coil.name, coil.input_unit),
-        )
+        self.channels = rig_channels(plant)
         self._pick = _relative_acceleration(programme, coil)
         self._ranges = np.array([s.range or math.inf for s in plant.sensor])
         fs = programme.sample_rate_hz

@@ -6,9 +6,9 @@ A session owns no clock, no socket and no file. What it decides depends on the b
 on nothing else, so that a replay repeats it.
 """
 
-import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -206,7 +206,7 @@ class Session:
             self._control_on = block.control_on
         masked = block.valid.size - int(block.valid.sum())
         if masked:
-            names = [c.name for c, ok in zip(self.channels, block.valid.all(axis=0), strict=True) if not ok]
+            names = [c.name for i, c in enumerate(self.channels) if not block.valid[:, i].all()]
             events.append(Event(first, "warning", f"{masked} samples masked in {', '.join(names)}"))
         return events
 
@@ -327,22 +327,42 @@ class Session:
                     return float(a / (math.tau * phasors.frequency_hz) ** order)
         return math.nan
 
-    def configuration_json(self) -> str:
-        """Settings as JSON, for the recording."""
+    def configuration(self) -> dict[str, Any]:
+        """Settings as plain data, for the recording; `settings_from` reads them back."""
         s = self.settings
-        return json.dumps(
-            {
-                "loop": None if s.loop is None else vars_of(s.loop),
-                "goal": vars_of(s.goal),
-                "schedule": None if s.schedule is None else s.schedule.model_dump(mode="json"),
-                "retune_every_blocks": s.retune_every_blocks,
-            }
+        return {
+            "loop": None if s.loop is None else asdict(s.loop),
+            "goal": asdict(s.goal),
+            "schedule": None if s.schedule is None else s.schedule.model_dump(mode="json"),
+            "learner": asdict(s.learner),
+            "retune_every_blocks": s.retune_every_blocks,
+            "model_step_ns_m": s.model_step_ns_m,
+            "min_change": s.min_change,
+        }
+
+
+def settings_from(configuration: dict[str, Any]) -> SessionSettings:
+    """Read what `Session.configuration` wrote.
+
+    Raises
+    ------
+    InputError
+        If it is not that.
+    """
+    try:
+        c = dict(configuration)
+        loop, schedule = c.pop("loop"), c.pop("schedule")
+        return SessionSettings(
+            loop=None if loop is None else LoopFacts(**loop),
+            schedule=None if schedule is None else GainSchedule.model_validate(schedule, strict=False),
+            goal=TuningGoal(**c.pop("goal")),
+            learner=LearnerSettings(**c.pop("learner")),
+            **c,
         )
-
-
-def vars_of(thing: object) -> dict[str, object]:
-    """Fields of a flat frozen dataclass by name."""
-    return {name: getattr(thing, name) for name in getattr(thing, "__slots__", ())}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"the recording's configuration cannot be read ({error}); was it made by another version?"
+        ) from error
 
 
 def _nominal_hz(plant: Plant) -> float:

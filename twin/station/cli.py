@@ -1,0 +1,321 @@
+"""The command line: ``atmd``."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from twin.plant.errors import InputError, RunError
+
+EXIT_INPUT, EXIT_RUN, EXIT_INTERRUPTED = 2, 3, 130
+
+app = typer.Typer(
+    name="atmd",
+    help="Digital twin of an active vibration rig: it runs beside the rig, learns its damping and retunes it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+people = Console(stderr=True)
+"""Where people read: standard error, so that standard output is the command's result alone."""
+
+JsonOption = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE|-", help="Write the figures as JSON to a file, or - for here."),
+]
+
+
+def main() -> None:
+    """Run a command; what the person's input or the rig did wrong ends in one message, not a traceback."""
+    try:
+        app(standalone_mode=True)
+    except InputError as error:
+        _complain(error)
+        sys.exit(EXIT_INPUT)
+    except RunError as error:
+        _complain(error)
+        sys.exit(EXIT_RUN)
+    except KeyboardInterrupt:
+        people.print("interrupted; what was recorded until here can be read", style="yellow")
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _complain(error: Exception) -> None:
+    for line in str(error).splitlines():
+        people.print(f"error: {line}", style="red", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command(epilog="Example: atmd demo --headless --seconds 60 --seed 1 --json -")
+def demo(
+    seconds: Annotated[
+        float, typer.Option(min=2.0, max=3600.0, help="Duration of the sweep 40 to 60 Hz [s].")
+    ] = 60.0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Sensor noise, and the true damping that is to be learned.")
+    ] = 0,
+    budget_w: Annotated[
+        float, typer.Option(min=1e-3, help="Mean Joule power the coil may burn, R i_rms² [W].")
+    ] = 4.0,
+    headless: Annotated[
+        bool, typer.Option("--headless", help="Open no window; draw a picture at the end.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
+    ] = False,
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Recording; runs/demo.rrd unless given.")
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="1 keeps real time, 0 goes as fast as the twin follows (if nobody watches)."
+        ),
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Run a simulated rig in a process of its own with the twin beside it: thesis Test 3, retuned as it runs.
+
+    The twin learns the coil's damping against frequency, retunes the gains under a power budget, and the rig obeys.
+    Attenuation is against the same rig without control. JSON keys: attenuation_mean, attenuation_worst (1 is perfect),
+    current_peak_a, joule_mean_w, joule_peak_w, electrical_mean_w (largest of any 100 ms), budget_w, budget_kind,
+    damping_rmse_ns_m (learned against true, 45 to 55 Hz), blocks, dropped, realtime_factor (time of data over time
+    in the loop), recording, picture.
+    """
+    from twin.station.demo import DemoOptions, run_demo
+    from twin.station.outputs import has_display
+
+    _must_be_rrd(save)
+    recording = save if save is not None else Path("runs") / "demo.rrd"
+    window = not headless and not web and has_display()
+    options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed)
+    with _bar("demo") as progress:
+        result = run_demo(options, _say, progress)
+    if not window and not web and result["blocks"]:
+        result["picture"] = _draw(recording)
+    _report(result, _demo_table, json_to)
+    _say(f"recording: {recording}   open it with: {_viewer_command(recording)}")
+    if "error" in result:
+        raise RunError(result["error"] + f" What was recorded until then is whole: {recording}")
+
+
+@app.command(
+    epilog="Examples: atmd replay runs/demo.rrd --json -   ·   "
+    "atmd replay beam.npz --plant beam.toml --channel tip_displacement=y:mm --channel piezo=u:V"
+)
+def replay(
+    file: Annotated[
+        Path, typer.Argument(help="Recording: .rrd of this program, or .npz.", show_default=False)
+    ],
+    plant: Annotated[
+        str | None, typer.Option(metavar="PRESET|FILE", help="Plant; an .rrd carries its own.")
+    ] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=ARRAY[:UNIT]", help="Where a sensor or command lies in an .npz; may be repeated."
+        ),
+    ] = None,
+    sample_rate: Annotated[
+        float | None,
+        typer.Option(min=1e-6, metavar="HZ", help="Sample rate of an .npz [Hz], if it does not say."),
+    ] = None,
+    sidecar: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="TOML or JSON with rate, units and channels of an .npz."),
+    ] = None,
+    save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record the replay.")] = None,
+    view: Annotated[bool, typer.Option("--view", help="Open Rerun's viewer.")] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
+    ] = False,
+    json_to: JsonOption = None,
+) -> None:
+    """Run the same loop on a recording, as fast as it goes.
+
+    Reports how well the observer predicts each sensor one step ahead, as rms(error)/std(signal) on rows that the
+    plant's parameters were not fitted on, with the known input and without; for rigs with a voice coil also
+    attenuation (against the model's passive motion), powers, and whether the decisions of the run are repeated.
+    JSON keys: nrmse, nrmse_without_input, sensors, blocks, samples, masked_samples, realtime_factor,
+    decisions_repeated, and those of the demo.
+    """
+    from twin.station.outputs import has_display
+    from twin.station.replay import ReplayOptions, run_replay
+
+    _must_be_rrd(save)
+    if view and not has_display():
+        raise InputError(
+            "--view: this machine has no display; use --web, or --save FILE.rrd and open that elsewhere"
+        )
+    options = ReplayOptions(plant, _channel_options(channel or []), sample_rate, sidecar, save, view, web)
+    with _bar("replay") as progress:
+        result = run_replay(file, options, _say, progress)
+    _report(result, _replay_table, json_to)
+
+
+@app.command(epilog="Example: atmd plants rig   ·   atmd plants my_rig.toml --json -")
+def plants(
+    plant: Annotated[
+        str | None, typer.Argument(metavar="[PRESET|FILE]", help="A plant to check and show.")
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """List the plants that ship with the program, or check one and show its natural frequencies."""
+    from twin.plant.files import load_plant, preset_names
+    from twin.plant.linear import natural_frequencies_hz
+
+    found = [load_plant(name) for name in ([plant] if plant is not None else preset_names())]
+    modes = [[float(f) for f in natural_frequencies_hz(p)] for p in found]
+    rows = [
+        {
+            "name": p.name,
+            "fingerprint": p.fingerprint,
+            "bodies": [b.name for b in p.body],
+            "actuators": [a.name for a in p.actuator],
+            "sensors": [s.name for s in p.sensor],
+            "natural_frequencies_hz": hz,
+            "limits": dict(p.limits),
+        }
+        for p, hz in zip(found, modes, strict=True)
+    ]
+
+    def table(_: dict[str, Any]) -> Table:
+        out = Table("plant", "bodies", "actuators", "sensors", "natural frequencies [Hz]", title="Plants")
+        for p, hz in zip(found, modes, strict=True):
+            parts = (", ".join(thing.name for thing in things) for things in (p.body, p.actuator, p.sensor))
+            out.add_row(p.name, *parts, ", ".join(f"{f:.2f}" for f in hz))
+        return out
+
+    _report({"plants": rows}, table, json_to)
+
+
+@app.command(epilog="Example: atmd doctor --json -")
+def doctor(json_to: JsonOption = None) -> None:
+    """Say what is installed, what is missing, and what to do about it. Ends with 1 if something needed is missing."""
+    from twin.station.doctor import as_json, as_table, exit_code, run_checks
+
+    checks = run_checks()
+    _report(as_json(checks), lambda _: as_table(checks), json_to)
+    raise typer.Exit(exit_code(checks))
+
+
+def _say(line: str) -> None:
+    people.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=people, transient=True, disable=not people.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _draw(recording: Path) -> str | None:
+    from twin.station.picture import save_picture
+
+    drawn = save_picture(recording, recording.with_suffix(".png"), time_s=None)
+    if drawn.note:
+        _say(drawn.note)
+    _say(f"picture: {drawn.path} ({drawn.how})")
+    return str(drawn.path)
+
+
+def _report(result: dict[str, Any], table: Callable[[dict[str, Any]], Table], json_to: str | None) -> None:
+    (Console() if json_to is None else people).print(table(result))
+    if json_to is None:
+        return
+    text = json.dumps(result, indent=2, allow_nan=False)
+    if json_to == "-":
+        sys.stdout.write(text + "\n")
+        return
+    try:
+        Path(json_to).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--json {json_to}: cannot be written ({error.strerror})") from error
+
+
+def _demo_table(r: dict[str, Any]) -> Table:
+    table = Table(
+        "figure", "value", "", title="Demo: thesis Test 3, retuned while it runs", title_justify="left"
+    )
+    table.add_row(
+        "mean attenuation, 45 to 55 Hz", _percent(r["attenuation_mean"]), "against the same rig, passive"
+    )
+    table.add_row("worst attenuation", _percent(r["attenuation_worst"]), "0.5 s after control came on")
+    table.add_row("peak current", _with_unit(r["current_peak_a"], "A"), "limit 2 A")
+    budget = f"budget {r['budget_w']:g} W ({r['budget_kind'].replace('_', ' ')})"
+    table.add_row("mean Joule power R i_rms²", _with_unit(r["joule_mean_w"], "W"), budget)
+    table.add_row("peak Joule power R i_peak²", _with_unit(r["joule_peak_w"], "W"), "")
+    table.add_row("mean electrical power v i", _with_unit(r["electrical_mean_w"], "W"), "")
+    table.add_row(
+        "damping c2(f), learned - true", _with_unit(r["damping_rmse_ns_m"], "Ns/m"), "rms, 45 to 55 Hz"
+    )
+    table.add_row("blocks, dropped", f"{r['blocks']}, {r['dropped']}", f"{r['commands']} commands obeyed")
+    table.add_row("real-time factor", _number(r["realtime_factor"]), "time of data / time in the loop")
+    return table
+
+
+def _replay_table(r: dict[str, Any]) -> Table:
+    table = Table("figure", "value", "", title=f"Replay of {r['file']}", title_justify="left")
+    table.add_row("plant", r["plant"], f"{r['sample_rate_hz']:g} samples/s")
+    table.add_row("blocks, samples", f"{r['blocks']}, {r['samples']}", f"{r['masked_samples']} values masked")
+    for s in r["sensors"]:
+        without = s["nrmse_without_input"]
+        remark = f"without the known input {without:.4f}" if without is not None else ""
+        table.add_row(f"NRMSE {s['sensor']}", f"{s['nrmse']:.4f}", f"{remark} ({s['rows']} rows)")
+    if r["attenuation_mean"] is not None:
+        table.add_row(
+            "mean attenuation", _percent(r["attenuation_mean"]), "against the model without control"
+        )
+    if r["joule_mean_w"] is not None:
+        table.add_row("mean Joule power", _with_unit(r["joule_mean_w"], "W"), "largest of any block")
+    if r["decisions_repeated"] is not None:
+        table.add_row(
+            "decisions repeated", "yes" if r["decisions_repeated"] else "no", f"{r['commands']} commands"
+        )
+    table.add_row("real-time factor", _number(r["realtime_factor"]), "time of data / time in the loop")
+    return table
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.1f} %"
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.3g} {unit}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _channel_options(options: list[str]) -> dict[str, str]:
+    pairs = {}
+    for option in options:
+        name, equals, array = option.partition("=")
+        if not (name and equals and array):
+            raise InputError(f"--channel {option}: write NAME=ARRAY:UNIT, such as tip_displacement=y:mm")
+        pairs[name] = array
+    return pairs
+
+
+def _must_be_rrd(path: Path | None) -> None:
+    if path is not None and path.suffix.lower() != ".rrd":
+        raise InputError(f"--save {path}: a recording's name ends in .rrd")
+
+
+def _viewer_command(recording: Path) -> str:
+    return f"{Path(sys.executable).with_name('rerun')} {recording}"
+
+
+if __name__ == "__main__":
+    main()

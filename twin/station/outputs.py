@@ -1,0 +1,187 @@
+"""Where a run's frames go: the recording, and whoever is watching. Shared by every command that runs the loop."""
+
+import json
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import rerun as rr
+
+from twin.plant.errors import RunError
+from twin.rig.recording import APPLICATION, Recorder
+from twin.station.frame import Frame
+from twin.station.live import LiveView, NativeViewer
+from twin.station.rerun_view import RerunView
+from twin.station.session import Session
+from twin.station.web import WebViewer
+
+FILE_HOLD_BLOCKS = 10
+LIVE_TREND_S = 30.0
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def keep_existing(path: Path) -> Path | None:
+    """Move a file that is in the way aside, to the first free ``NAME.k.SUFFIX``; None if there was none.
+
+    Nothing recorded is lost because a name was used twice.
+    """
+    if not path.exists():
+        return None
+    k = 1
+    while (aside := path.with_name(f"{path.stem}.{k}{path.suffix}")).exists():
+        k += 1
+    path.rename(aside)
+    return aside
+
+
+class Outputs:
+    """Recording and views of one run; a context manager that leaves a readable recording however it ends.
+
+    Parameters
+    ----------
+    session
+        Gives plant, channels and configuration.
+    recording
+        File to write; None for none.
+    setup
+        Markdown about the run, for the view.
+    run_config_json, seed
+        Kept in the recording.
+    window
+        Open Rerun's own viewer.
+    web
+        Serve Rerun's web viewer on this machine.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        recording: Path | None,
+        setup: str,
+        run_config_json: str,
+        seed: int | None,
+        window: bool = False,
+        web: bool = False,
+    ) -> None:
+        self._session = session
+        self._setup = setup
+        self.recorder: Recorder | None = None
+        self._file_view: RerunView | None = None
+        self.live: LiveView | None = None
+        self._viewer: NativeViewer | None = None
+        self._web: WebViewer | None = None
+        self.url = ""
+        self.moved_aside: Path | None = None
+        if recording is not None:
+            recording.parent.mkdir(parents=True, exist_ok=True)
+            self.moved_aside = keep_existing(recording)
+            self.recorder = Recorder(
+                recording,
+                plant=session.plant,
+                sample_rate_hz=session.observer.sample_rate_hz,
+                channels=session.channels,
+                run_config_json=run_config_json,
+                seed=seed,
+            )
+            self._file_view = self._view(self.recorder.stream, hold_blocks=FILE_HOLD_BLOCKS, follow=False)
+        if web or window:
+            stream = rr.RecordingStream(APPLICATION)
+            if web:
+                self._web = WebViewer(stream)
+                self.url = self._web.start()
+            else:
+                self._viewer = NativeViewer()
+                stream.connect_grpc(self._viewer.start())
+            self.live = LiveView(self._view(stream, trend_s=LIVE_TREND_S))
+
+    def _view(
+        self,
+        stream: rr.RecordingStream,
+        *,
+        hold_blocks: int = 1,
+        trend_s: float | None = None,
+        follow: bool = True,
+    ) -> RerunView:
+        session = self._session
+        return RerunView(
+            stream,
+            plant=session.plant,
+            sample_rate_hz=session.observer.sample_rate_hz,
+            channels=session.channels,
+            schedule=session.schedule,
+            setup=self._setup,
+            hold_blocks=hold_blocks,
+            trend_s=trend_s,
+            follow=follow,
+        )
+
+    def take(self, frame: Frame) -> None:
+        """Keep and show one frame.
+
+        Raises
+        ------
+        RunError
+            If the recording can no longer be written.
+        """
+        recorder = self.recorder
+        if recorder is not None:
+            recorder.write_block(frame.block)
+            sample = frame.block.end_sample - 1
+            if frame.command is not None:
+                recorder.write_command(frame.command)
+            for answer in frame.acknowledgements:
+                recorder.write_acknowledgement(answer, sample)
+            for event in frame.events:
+                recorder.write_note("events", event.sample, json.dumps(asdict(event)))
+            if frame.decision is not None:
+                recorder.write_note("decisions", frame.decision.sample, json.dumps(asdict(frame.decision)))
+        if self._file_view is not None:
+            self._file_view.show(frame)
+        if self.live is not None:
+            self.live.show(frame)
+
+    @property
+    def watching(self) -> bool:
+        """Whether somebody may be looking at this run as it happens."""
+        return self.live is not None
+
+    @property
+    def frames_unseen(self) -> int:
+        """Frames the live view could not take."""
+        return self.live.dropped if self.live is not None else 0
+
+    def finish(self) -> None:
+        """Finish the recording, so that it can be read; views stay open. Raises RunError if it cannot be."""
+        if self._file_view is not None:
+            self._file_view.send()
+            self._file_view = None
+        if self.recorder is not None:
+            self.recorder.close()
+            self.recorder = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.finish()
+        except RunError:
+            if error is None:
+                raise
+        finally:
+            if self.live is not None:
+                self.live.close()
+            if self._web is not None:
+                self._web.stop()

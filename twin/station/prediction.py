@@ -1,0 +1,96 @@
+"""How well the observer predicts: one-step errors on rows the parameters were not fitted on.
+
+The known input must earn its place: a second observer that knows no input runs beside the first.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.observer import Observer
+from estimators.types import StateEstimate
+from twin.plant.blocks import Block, Channel
+from twin.plant.config import Plant
+from twin.plant.inputs import InputSource
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One sensor's normalised root mean square error of the one-step prediction.
+
+    Attributes
+    ----------
+    nrmse
+        rms(innovation) / std(measured), over the scored rows.
+    nrmse_without_input
+        The same for an observer that knows no input; None where no input is recorded.
+    rows
+        Valid rows that were scored.
+    """
+
+    sensor: str
+    nrmse: float
+    nrmse_without_input: float | None
+    rows: int
+
+
+class PredictionScore:
+    """Collect one-step errors of a run.
+
+    Parameters
+    ----------
+    plant, channels, sample_rate_hz
+        As the observer's.
+    sources
+        Its inputs; where any is recorded, a second observer without inputs runs beside it.
+    fitted_rows
+        Ranges (first, end) of rows that do not count.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        channels: Sequence[Channel],
+        sample_rate_hz: float,
+        sources: Sequence[InputSource],
+        fitted_rows: Sequence[tuple[int, int]],
+    ) -> None:
+        names = tuple(c.name for c in channels)
+        self._fitted = tuple(fitted_rows)
+        self._blind: Observer | None = None
+        commanded = [s for s in sources if s.channel is not None and not s.by_current]
+        if commanded and len(commanded) == len([s for s in sources if s.channel is not None]):
+            unknown = [InputSource(s.actuator, None, s.hold) for s in sources]
+            self._blind = Observer(plant, names, sample_rate_hz, sources=unknown)
+        self._columns: dict[str, int] = {name: names.index(name) for name in names}
+        self._sums: dict[str, list[float]] = {}
+
+    def add(self, block: Block, estimate: StateEstimate) -> None:
+        """Score one block, unless any of its rows was fitted on."""
+        blind = self._blind.advance(block) if self._blind is not None else None
+        if any(block.first_sample < end and first < block.end_sample for first, end in self._fitted):
+            return
+        for row, sensor in enumerate(estimate.sensors):
+            y = block.values[:, self._columns[sensor]][block.valid[:, self._columns[sensor]]]
+            if len(y) == 0:
+                continue
+            sums = self._sums.setdefault(sensor, [0.0] * 5)
+            sums[0] += len(y)
+            sums[1] += float(np.sum(y))
+            sums[2] += float(np.sum(y * y))
+            sums[3] += len(y) * float(estimate.innovation_rms[row]) ** 2
+            if blind is not None and sensor in blind.sensors:
+                sums[4] += len(y) * float(blind.innovation_rms[blind.sensors.index(sensor)]) ** 2
+
+    def scores(self) -> tuple[Score, ...]:
+        """One score per sensor that was seen."""
+        out = []
+        for sensor, (n, total, squares, informed, blind) in self._sums.items():
+            spread = math.sqrt(max(squares / n - (total / n) ** 2, 0.0))
+            if spread == 0.0:
+                continue
+            without = math.sqrt(blind / n) / spread if self._blind is not None else None
+            out.append(Score(sensor, math.sqrt(informed / n) / spread, without, int(n)))
+        return tuple(out)

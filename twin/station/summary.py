@@ -1,0 +1,114 @@
+"""What a run came to, in figures: collected frame by frame, worked out once at the end."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from estimators.types import DampingCurve
+from twin.plant.config import DampingTable
+from twin.plant.linear import Array
+from twin.station.frame import Frame
+
+BAND_HZ = (45.0, 55.0)
+SETTLED_S = 0.5
+"""The attenuation counts from this long after the controller came on: before, it is the transient's."""
+
+
+@dataclass(slots=True)
+class RunLog:
+    """Per-block figures of a run."""
+
+    frequency_hz: list[float] = field(default_factory=list)
+    settled: list[bool] = field(default_factory=list)
+    controlled: list[bool] = field(default_factory=list)
+    displacement_m: list[float] = field(default_factory=list)
+    passive_m: list[float] = field(default_factory=list)
+    current_peak_a: list[float] = field(default_factory=list)
+    joule_mean_w: list[float] = field(default_factory=list)
+    joule_peak_w: list[float] = field(default_factory=list)
+    electrical_mean_w: list[float] = field(default_factory=list)
+    nis: list[float] = field(default_factory=list)
+    curve: DampingCurve | None = None
+    blocks: int = 0
+    samples: int = 0
+    masked: int = 0
+    commands: int = 0
+    _on_for_s: float = 0.0
+
+    def add(self, frame: Frame) -> None:
+        """Take one frame in."""
+        block = frame.block
+        self.blocks += 1
+        self.samples += block.n_samples
+        self.masked += block.valid.size - int(block.valid.sum())
+        self.commands += frame.command is not None
+        self.curve = frame.curve or self.curve
+        self._on_for_s = self._on_for_s + block.n_samples / block.sample_rate_hz if block.control_on else 0.0
+        self.nis.append(frame.estimate.nis)
+        p = frame.performance
+        self.frequency_hz.append(frame.phasors.frequency_hz if frame.phasors is not None else math.nan)
+        self.settled.append(self._on_for_s > SETTLED_S)
+        self.controlled.append(bool(block.control_on))
+        self.displacement_m.append(p.displacement_m if p else math.nan)
+        self.passive_m.append(p.passive_m if p else math.nan)
+        self.current_peak_a.append(p.current_peak_a if p else math.nan)
+        self.joule_mean_w.append(p.powers.joule_mean_w if p else math.nan)
+        self.joule_peak_w.append(p.powers.joule_peak_w if p else math.nan)
+        self.electrical_mean_w.append(p.powers.electrical_mean_w if p else math.nan)
+
+    def attenuation(self, passive_m: Array | None = None) -> Array:
+        """1 - controlled/passive motion of the settled, controlled blocks inside the band.
+
+        Parameters
+        ----------
+        passive_m
+            (n_blocks,) motion of the passive rig [m]; the model's prediction where not given.
+        """
+        f = np.array(self.frequency_hz)
+        inside = np.array(self.settled, dtype=bool) & (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
+        reference = np.array(self.passive_m) if passive_m is None else passive_m[: len(f)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(1.0 - np.array(self.displacement_m)[inside] / reference[inside])
+
+    def figures(self, passive_m: Array | None = None, truth: DampingTable | None = None) -> dict[str, Any]:
+        """Figures by name; None where the run cannot tell.
+
+        Powers and current are the largest of any block: a budget is kept by the worst of them, not the mean.
+        """
+        attenuation = self.attenuation(passive_m)
+        finite = attenuation[np.isfinite(attenuation)]
+        return {
+            "attenuation_mean": float(finite.mean()) if len(finite) else None,
+            "attenuation_worst": float(finite.min()) if len(finite) else None,
+            "current_peak_a": _largest(self.current_peak_a),
+            "joule_mean_w": _largest(self.joule_mean_w),
+            "joule_peak_w": _largest(self.joule_peak_w),
+            "electrical_mean_w": _largest(self.electrical_mean_w),
+            "damping_rmse_ns_m": None
+            if truth is None or self.curve is None
+            else damping_rmse(self.curve, truth),
+            "nis_median": _median(self.nis),
+            "blocks": self.blocks,
+            "samples": self.samples,
+            "masked_samples": self.masked,
+            "commands": self.commands,
+        }
+
+
+def damping_rmse(curve: DampingCurve, truth: DampingTable) -> float:
+    """Root mean square of learned minus true damping over the band [Ns/m]."""
+    f = np.linspace(*BAND_HZ, 101)
+    learned = np.interp(f, curve.frequency_hz, curve.damping_ns_m)
+    return float(np.sqrt(np.mean((learned - np.array([truth.at(x) for x in f])) ** 2)))
+
+
+def _largest(values: list[float]) -> float | None:
+    known = [v for v in values if math.isfinite(v)]
+    return max(known) if known else None
+
+
+def _median(values: list[float]) -> float | None:
+    known = [v for v in values if math.isfinite(v)]
+    return float(np.median(known)) if known else None
