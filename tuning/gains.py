@@ -93,7 +93,7 @@ class GainProgram:
         matrix: Array,
         lower: NDArray[np.floating],
         upper: NDArray[np.floating],
-        warm: Array,
+        warm: NDArray[np.floating],
     ) -> Array:
         P = sparse.csc_matrix(np.triu(np.ones((3, 3))))
         A = sparse.csc_matrix(np.ones(matrix.shape))
