@@ -126,7 +126,8 @@ def rig_block(
                 + (gains_from[1] + w * (gains_to[1] - gains_from[1])) * v
                 + (gains_from[2] + w * (gains_to[2] - gains_from[2])) * s
             )
-            command = min(max(command, -clamp), clamp)
+            # Gains beyond all measure make inf - inf: what is no number must not reach the converter.
+            command = 0.0 if math.isnan(command) else min(max(command, -clamp), clamp)
         for j in range(d - 1):
             delay_line[j] = delay_line[j + 1]
         delay_line[d - 1] = command
@@ -249,9 +250,9 @@ class SimulatedRig:
         limits, name = self._plant.limits, self._coil.name
         self._heating.append(self._coil.resistance_ohm * float(np.mean(reference**2)))
         power = sum(self._heating) / len(self._heating)
-        if stroke > limits["stroke_m"]:
+        if not stroke <= limits["stroke_m"]:
             self.tripped = f"stroke {stroke * 1e3:.2f} mm passed the limit {limits['stroke_m'] * 1e3:.2f} mm"
-        elif power > limits[f"{name}_power_w"]:
+        elif not power <= limits[f"{name}_power_w"]:
             self.tripped = f"{name} power {power:.1f} W passed the limit {limits[f'{name}_power_w']:.1f} W"
 
     def _packed(self, frequency_hz: float) -> Array:
