@@ -5,7 +5,8 @@ set -eu
 
 venv=$1
 shift
-if ! "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" "$@"; then
+# Bytecode is compiled here, once: it takes seconds off every start, and some machines never write it later.
+if ! "$venv/bin/uv" pip install --quiet --compile-bytecode --python "$venv/bin/python" "$@"; then
     echo "uv could not install this; trying with pip ..." >&2
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"
 fi
