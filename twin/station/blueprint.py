@@ -27,9 +27,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     trend = None if layout.trend_s is None else _window(layout.trend_s)
     has_coil = layout.plant.voice_coil is not None
 
-    lanes = rrb.StateTimelineView(
-        origin="state", name="State of control, damping learner, model", time_ranges=trend
-    )
+    lanes = rrb.StateTimelineView(origin="state", name="State of control, damping learner, model")
     vibration = _trend("vibration", f"Vibration of the {primary} at the excitation [µm]", trend)
     waveforms = [
         _waveform(path, f"{name}: measured and twin" if k == 0 else name)

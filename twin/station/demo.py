@@ -5,25 +5,22 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimators.excitation import ExcitationTracker, choose_reference
-from tuning.loop import LoopFacts
-from tuning.retune import TuningGoal
 from tuning.rule import scheduling_rule
-from twin.plant.blocks import make_block
+from twin.plant.blocks import Channel, make_block
 from twin.plant.config import DampingTable
 from twin.plant.errors import RunError
 from twin.plant.files import load_plant
 from twin.plant.linear import Array
 from twin.rig.gateway import EmbeddedRig
 from twin.rig.programme import Programme, Sweep
-from twin.rig.simulated import SimulatedRig
-from twin.station.outputs import Outputs
-from twin.station.session import Session, SessionSettings
-from twin.station.summary import RunLog
+
+if TYPE_CHECKING:
+    from tuning.retune import TuningGoal
+    from twin.station.session import Session
 
 TABLE_HZ = tuple(float(f) for f in np.arange(45.0, 55.01, 0.5))
 SWEEP_HZ = (40.0, 60.0)
@@ -79,8 +76,11 @@ def demo_programme(seconds: float, seed: int) -> Programme:
     )
 
 
-def session_for(programme: Programme, channels: Any, goal: TuningGoal) -> Session:
+def session_for(programme: Programme, channels: tuple[Channel, ...], goal: "TuningGoal") -> "Session":
     """Return the twin of a programme: it knows everything of it but the true damping."""
+    from tuning.loop import LoopFacts
+    from twin.station.session import Session, SessionSettings
+
     facts = LoopFacts(
         programme.sample_rate_hz, programme.loop_delay_samples, programme.measurement == "relative"
     )
@@ -106,10 +106,15 @@ def run_demo(
         Figures by name (see the command's help); ``error`` is there if the rig failed.
     """
     programme = demo_programme(options.seconds, options.seed)
-    goal = TuningGoal(budget_w=options.budget_w)
     speed = options.speed if options.speed is not None else (1.0 if options.window or options.web else 0.0)
-    log, in_loop_s, error = RunLog(), 0.0, ""
     with EmbeddedRig(programme, speed) as rig:
+        # The rig starts up on another core while this process loads its solvers and viewer: seconds saved.
+        from tuning.retune import TuningGoal
+        from twin.station.outputs import Outputs
+        from twin.station.summary import RunLog
+
+        log, in_loop_s, error = RunLog(), 0.0, ""
+        goal = TuningGoal(budget_w=options.budget_w)
         session = session_for(programme, rig.channels, goal)
         setup = describe_run(programme, options)
         with Outputs(
@@ -165,6 +170,9 @@ def run_demo(
 
 def passive_displacement(programme: Programme, n_blocks: int) -> Array:
     """Motion of the same rig without control [m], block by block at the excitation, from a run of its own."""
+    from estimators.excitation import ExcitationTracker, choose_reference
+    from twin.rig.simulated import SimulatedRig
+
     quiet = programme.schedule.model_copy(update={"on_from_hz": 1e-3, "on_to_hz": 1e-3})
     rig = SimulatedRig(programme.model_copy(update={"schedule": quiet}))
     names = tuple(c.name for c in rig.channels)

@@ -8,6 +8,8 @@ import threading
 import time
 from collections import deque
 
+import rerun as rr
+
 from twin.plant.errors import RunError
 from twin.rig.rerun_tool import rerun_environment, rerun_program
 from twin.station.frame import Frame
@@ -22,9 +24,11 @@ class LiveView:
     Parameters
     ----------
     view
-        The view; nobody else may use it or its stream from now on.
+        The view; nobody else may use it or its stream from now on. Closing disconnects the stream.
     depth
         Frames that may wait; the oldest goes when another one comes.
+    viewer
+        The viewer it feeds if that was started here; one that no longer answers at the end is stopped.
 
     Attributes
     ----------
@@ -34,8 +38,9 @@ class LiveView:
         What stopped the view, if anything did.
     """
 
-    def __init__(self, view: RerunView, *, depth: int = 50) -> None:
+    def __init__(self, view: RerunView, *, depth: int = 50, viewer: "NativeViewer | None" = None) -> None:
         self._view = view
+        self._viewer = viewer
         self._depth = depth
         self._waiting: deque[Frame] = deque()
         self._change = threading.Condition()
@@ -58,11 +63,22 @@ class LiveView:
             self._change.notify()
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Show what waits, for as long as that takes but no longer than the time-out [s]."""
+        """Show what waits and disconnect, for as long as that takes but no longer than the time-out [s]."""
         with self._change:
             self._closing = True
             self._change.notify()
         self._thread.join(timeout_s)
+        if not self._thread.is_alive():
+            return
+        with self._change:
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+        if self._viewer is not None:
+            self._viewer.stop()
+            self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            # At exit Rerun would wait for this viewer for ever; the thread that waits instead ends with us.
+            rr.unregister_shutdown()
 
     def _feed(self) -> None:
         while True:
@@ -80,7 +96,7 @@ class LiveView:
                     self.dropped += 1 + len(self._waiting)
                     self._waiting.clear()
                 return
-        self._view.send()
+        self._view.disconnect()
 
 
 class NativeViewer:
@@ -89,12 +105,12 @@ class NativeViewer:
     Parameters
     ----------
     memory_limit
-        Where the viewer begins to forget the oldest data, such as ``400MB``.
+        Where the viewer begins to forget the oldest data, such as ``200MB``; it needs about 400 MB besides.
     headless
         Draw nothing on a screen; for tests and pictures.
     """
 
-    def __init__(self, *, memory_limit: str = "400MB", headless: bool = False) -> None:
+    def __init__(self, *, memory_limit: str = "200MB", headless: bool = False) -> None:
         self._memory_limit = memory_limit
         self._headless = headless
         self._process: subprocess.Popen[bytes] | None = None
@@ -109,7 +125,7 @@ class NativeViewer:
         """
         port = free_port()
         command = [rerun_program(), "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
-        command += ["--memory-limit", self._memory_limit, "--server-memory-limit", "50MB"]
+        command += ["--memory-limit", self._memory_limit, "--server-memory-limit", "10MB"]
         command += ["--window-size", "1600x1000", *(["--headless"] if self._headless else [])]
         with tempfile.TemporaryFile() as log:
             self._process = subprocess.Popen(
@@ -136,7 +152,7 @@ class NativeViewer:
         if self._process.poll() is None:
             self._process.terminate()
             try:
-                self._process.wait(5.0)
+                self._process.wait(2.0)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()

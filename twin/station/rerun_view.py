@@ -111,6 +111,11 @@ class RerunView:
         self._held = 0
         self._columns.send()
 
+    def disconnect(self) -> None:
+        """Send what is held back and let go of the stream; for one that only this view uses."""
+        self.send()
+        self._stream.disconnect()
+
     def _show_waveforms(self, frame: Frame) -> None:
         block = frame.block
         rows = slice((-block.first_sample) % self._step, None, self._step)

@@ -125,6 +125,7 @@ def viewer_app(files: Path, data_port: int) -> FastAPI:
 
     @app.middleware("http")
     async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        """Add the headers that keep the page to itself."""
         response = await call_next(request)
         response.headers["Content-Security-Policy"] = policy
         response.headers["X-Content-Type-Options"] = "nosniff"
