@@ -126,11 +126,12 @@ class RigServer:
                     "the station fell silent",
                 )
             silent_s = (self.rig.next_sample - self._station_sample) / programme.sample_rate_hz
-            if silent_s > HEARTBEAT_TIMEOUT_S + block_s and not fallen_back:
+            if self.speed > 0.0 and silent_s > HEARTBEAT_TIMEOUT_S + block_s:
                 # Safe gains: none. What the station last ordered may not fit what the rig does by now.
                 self.rig.control_enabled, fallen_back = False, True
             first = self.rig.next_sample
             values, control_on, acknowledgements = self.rig.next_block()
+            fallen_back = fallen_back and not self.rig.control_enabled
             if self.speed > 0.0:
                 due = begin + (sequence + 1) * block_s / self.speed
                 while (left := due - time.monotonic()) > 0.0:
@@ -143,7 +144,7 @@ class RigServer:
                 "channels": [{"name": c.name, "unit": c.unit} for c in self.rig.channels],
                 "config_id": programme.plant.fingerprint,
                 "control_on": control_on,
-                "commands_applied": [a.command_id for a in acknowledgements],
+                "commands_applied": [a.command_id for a in acknowledgements if a.accepted],
                 "notice": self.rig.tripped or ("station lost: control off" if fallen_back else ""),
             }
             self._samples.send_multipart([TOPIC_SAMPLES, encode(header), values.astype("<f4").tobytes()])
@@ -173,7 +174,8 @@ class RigServer:
             case "stop":
                 self._stopped = True
             case "heartbeat" if isinstance(message.get("next_sample"), int):
-                self._station_sample = max(self._station_sample, message["next_sample"])
+                told = min(message["next_sample"], self.rig.next_sample)  # nobody is ahead of the rig
+                self._station_sample = max(self._station_sample, told)
             case "command":
                 self._command(message.get("command"))
             case _:

@@ -57,6 +57,11 @@ class Programme(Frozen):
                 raise ValueError(
                     f"limits.{key} [{unit}] is missing: without it the coil may not be driven; add it"
                 )
+        fastest = max(self.schedule.low_pass_hz + self.schedule.high_pass_hz)
+        if fastest >= 0.5 * self.sample_rate_hz:
+            raise ValueError(
+                f"schedule: cutoff {fastest:g} Hz is not below half of the sample rate ({self.sample_rate_hz:g} Hz)"
+            )
         return self
 
     @property

@@ -231,6 +231,13 @@ class SimulatedRig:
         self._pending = [c for c in self._pending if c.apply_at_sample > first]
         answers = []
         for command in due:
+            fastest = (
+                max(command.schedule.low_pass_hz + command.schedule.high_pass_hz) if command.schedule else 0.0
+            )
+            if fastest >= 0.5 * self.programme.sample_rate_hz:
+                reason = f"cutoff {fastest:g} Hz is not below half of the sample rate"
+                answers.append(Acknowledgement(command_id=command.command_id, accepted=False, reason=reason))
+                continue
             late = first - command.apply_at_sample
             if command.schedule is not None:
                 self.schedule = command.schedule
