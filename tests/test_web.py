@@ -40,7 +40,6 @@ def served() -> Iterator[tuple[str, rr.RecordingStream]]:
     viewer = WebViewer(stream)
     yield viewer.start(), stream
     viewer.stop()
-    stream.disconnect()
 
 
 class NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -156,7 +155,7 @@ def test_a_browser_draws_the_run_and_asks_nobody_else(
     view = RerunView(
         stream, plant=plant, sample_rate_hz=RATE, channels=channels(plant), schedule=schedule(), hold_blocks=5
     )
-    live = LiveView(view, depth=100)
+    live = LiveView(view, depth=100, keep_stream=True)
     for frame in frames(plant, 6.0):
         live.show(frame)
     live.close(10.0)

@@ -24,9 +24,11 @@ class LiveView:
     Parameters
     ----------
     view
-        The view; nobody else may use it or its stream from now on. Closing disconnects the stream.
+        The view; nobody else may use it or its stream from now on.
     depth
         Frames that may wait; the oldest goes when another one comes.
+    keep_stream
+        Leave the stream connected at the end: a `WebViewer` goes on serving what it was given.
     viewer
         The viewer it feeds if that was started here; one that no longer answers at the end is stopped.
 
@@ -38,7 +40,15 @@ class LiveView:
         What stopped the view, if anything did.
     """
 
-    def __init__(self, view: RerunView, *, depth: int = 50, viewer: "NativeViewer | None" = None) -> None:
+    def __init__(
+        self,
+        view: RerunView,
+        *,
+        depth: int = 50,
+        keep_stream: bool = False,
+        viewer: "NativeViewer | None" = None,
+    ) -> None:
+        self._at_end = view.send if keep_stream else view.disconnect
         self._view = view
         self._viewer = viewer
         self._depth = depth
@@ -63,7 +73,7 @@ class LiveView:
             self._change.notify()
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Show what waits and disconnect, for as long as that takes but no longer than the time-out [s]."""
+        """Show what waits and finish, for as long as that takes but no longer than the time-out [s]."""
         with self._change:
             self._closing = True
             self._change.notify()
@@ -96,7 +106,7 @@ class LiveView:
                     self.dropped += 1 + len(self._waiting)
                     self._waiting.clear()
                 return
-        self._view.disconnect()
+        self._at_end()
 
 
 class NativeViewer:

@@ -46,7 +46,7 @@ class WebViewer:
     Parameters
     ----------
     stream
-        Its sinks are replaced by a server for the viewer; feed it through a `LiveView`.
+        Its sinks are replaced by a server for the viewer; feed it through a `LiveView` that keeps the stream.
     memory_limit
         How much of the run is kept for browsers that come late, such as ``100MB``.
     """
@@ -108,7 +108,8 @@ class WebViewer:
         return f"{page}/"
 
     def stop(self) -> None:
-        """Stop serving the page; browsers keep what they have."""
+        """Stop serving; browsers keep what they have."""
+        self._stream.disconnect()
         if self._server is not None and self._thread is not None:
             self._server.should_exit = True
             self._thread.join(5.0)
