@@ -106,6 +106,8 @@ class LearnerSettings:
         Random walk of the knots beside the excitation [Ns/m per sqrt(s)]; the others keep what they know.
     floor_std_ns_m
         No single block is believed better than this: phase of sensors, curvature between knots.
+    transient_std_ns
+        And by so much less the faster its amplitudes move [Ns/m per 1/s].
     rate_limit_ns_m_s
         How fast the value in use follows the learned one.
     max_block_std_ns_m, max_transient_1_s
@@ -120,7 +122,8 @@ class LearnerSettings:
     prior_std_ns_m: float = 8.0
     prior_length_hz: float = 10.0
     forgetting_ns_m_sqrt_s: float = 0.05
-    floor_std_ns_m: float = 0.02
+    floor_std_ns_m: float = 0.03
+    transient_std_ns: float = 0.3
     rate_limit_ns_m_s: float = 5.0
     max_block_std_ns_m: float = 1.0
     max_transient_1_s: float = 1.0
@@ -220,13 +223,13 @@ class DampingLearner:
         if balance.transient_1_s > settings.max_transient_1_s:
             return "transient"
         h = self._weights(balance.frequency_hz)
-        spread = math.hypot(balance.damping_std_ns_m, settings.floor_std_ns_m)
-        sigma = math.sqrt(float(h @ self._covariance @ h) + spread**2)
+        sigma = math.sqrt(float(h @ self._covariance @ h) + self._variance(balance))
         if abs(balance.damping_ns_m - float(h @ self._mean)) > settings.outlier_sigmas * sigma:
             self._strays += 1
             if self._strays < 5:
                 return "outlier"
-            self._covariance = self._prior.copy()  # five in a row: it is the curve that is wrong
+            # Several in a row: it is the curve that is wrong, here; what is known elsewhere stays known.
+            self._covariance += np.diag((h > 0.0) * np.diag(self._prior))
         self._strays = 0
         return ""
 
@@ -234,14 +237,19 @@ class DampingLearner:
         settings = self.settings
         h = self._weights(balance.frequency_hz)
         self._covariance += np.diag(h * settings.forgetting_ns_m_sqrt_s**2 * elapsed_s)
-        variance = balance.damping_std_ns_m**2 + settings.floor_std_ns_m**2
-        scalar_update(self._mean, self._covariance, h, variance, balance.damping_ns_m)
+        scalar_update(self._mean, self._covariance, h, self._variance(balance), balance.damping_ns_m)
         self._covariance = 0.5 * (self._covariance + self._covariance.T)
         weight, old = 1.0 / balance.stiffness_std_n_m**2, 1.0 / self._stiffness_variance
         previous = self._stiffness if self._accepted else 0.0
         self._stiffness = (old * previous + weight * balance.stiffness_n_m) / (old + weight)
         self._stiffness_variance = 1.0 / (old + weight)
         self._accepted += 1
+
+    def _variance(self, balance: ForceBalance) -> float:
+        """Variance of a block's damping [(Ns/m)²]: its noise, and what the phasors of a moving state get wrong."""
+        settings = self.settings
+        model_error = settings.floor_std_ns_m + settings.transient_std_ns * balance.transient_1_s
+        return balance.damping_std_ns_m**2 + model_error**2
 
     def _weights(self, frequency_hz: float) -> Array:
         """Hat functions of the knots at a frequency."""

@@ -152,8 +152,9 @@ class Retuner:
         excitation_hz: float,
         excitation_amplitude: float,
         schedule: GainSchedule,
+        ahead_hz: float = 0.0,
     ) -> Proposal:
-        """Retune the table's points around the excitation.
+        """Retune the table's points around the excitation, and those it is about to pass.
 
         Parameters
         ----------
@@ -167,11 +168,14 @@ class Retuner:
             Of the excitation: frequency [Hz] and peak, in the exciting actuator's unit.
         schedule
             The one in use; cutoffs are kept.
+        ahead_hz
+            How far the excitation will have moved when the next proposal could take effect [Hz].
         """
+        low, high = sorted((excitation_hz, excitation_hz + ahead_hz))
         points: list[tuple[int, OperatingPoint]] = []
         troubles: list[str] = []
         for row, frequency in enumerate(schedule.frequency_hz):
-            if abs(frequency - excitation_hz) > self.goal.reach_hz:
+            if not low - self.goal.reach_hz <= frequency <= high + self.goal.reach_hz:
                 continue
             try:
                 point = self._tune(

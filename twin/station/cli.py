@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -98,7 +98,7 @@ def demo(
     window = not headless and not web and has_display()
     options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed)
     with _bar("demo") as progress:
-        result = run_demo(options, _say, progress)
+        result = run_demo(options, _say, progress, _wait_for_browser if web else None)
     if not window and not web and result["blocks"]:
         result["picture"] = _draw(recording)
     _report(result, _demo_table, json_to)
@@ -157,7 +157,7 @@ def replay(
         )
     options = ReplayOptions(plant, _channel_options(channel or []), sample_rate, sidecar, save, view, web)
     with _bar("replay") as progress:
-        result = run_replay(file, options, _say, progress)
+        result = run_replay(file, options, _say, progress, _wait_for_browser if web else None)
     _report(result, _replay_table, json_to)
 
 
@@ -217,6 +217,14 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=people, transient=True, disable=not people.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _wait_for_browser() -> None:
+    """Keep serving until the person at the terminal has seen enough; without one, end with the run."""
+    if sys.stdin.isatty() and people.is_terminal:
+        people.print("The run is over; the page stays. Press Enter to end.", style="yellow")
+        with suppress(EOFError):
+            input()
 
 
 def _draw(recording: Path) -> str | None:

@@ -89,7 +89,10 @@ def session_for(programme: Programme, channels: tuple[Channel, ...], goal: "Tuni
 
 
 def run_demo(
-    options: DemoOptions, say: Callable[[str], None], progress: Callable[[int, int], None]
+    options: DemoOptions,
+    say: Callable[[str], None],
+    progress: Callable[[int, int], None],
+    linger: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Run the demonstration to its end, or to the rig's.
 
@@ -99,6 +102,8 @@ def run_demo(
         Takes lines for the person.
     progress
         Takes blocks done and blocks in all.
+    linger
+        Called when the run is over and its recording finished, while the views are still served.
 
     Returns
     -------
@@ -149,6 +154,7 @@ def run_demo(
             except RunError as failure:
                 error = str(failure)
             outputs.finish()
+            gateway.close()
             dropped, unseen = gateway.dropped, outputs.frames_unseen
             passive = passive_displacement(programme, log.blocks)
             result = {
@@ -165,6 +171,8 @@ def run_demo(
             }
             if error:
                 result["error"] = error
+            if linger is not None:
+                linger()
             return result
 
 

@@ -102,7 +102,9 @@ class Outputs:
             else:
                 self._viewer = NativeViewer()
                 stream.connect_grpc(self._viewer.start())
-            self.live = LiveView(self._view(stream, trend_s=LIVE_TREND_S))
+            self.live = LiveView(
+                self._view(stream, trend_s=LIVE_TREND_S), keep_stream=web, viewer=self._viewer
+            )
 
     def _view(
         self,

@@ -68,7 +68,11 @@ class Opened:
 
 
 def run_replay(
-    path: Path, options: ReplayOptions, say: Callable[[str], None], progress: Callable[[int, int], None]
+    path: Path,
+    options: ReplayOptions,
+    say: Callable[[str], None],
+    progress: Callable[[int, int], None],
+    linger: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through the loop.
 
@@ -80,6 +84,8 @@ def run_replay(
         Takes lines for the person.
     progress
         Takes samples done and samples in all.
+    linger
+        Called when the run is over and its recording finished, while the views are still served.
 
     Returns
     -------
@@ -132,6 +138,8 @@ def run_replay(
             score.add(block, frame.estimate)
             progress(block.end_sample, opened.n_samples)
         outputs.finish()
+        if linger is not None:
+            linger()
     scores = score.scores()
     return {
         **log.figures(),

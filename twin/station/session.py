@@ -30,6 +30,9 @@ from twin.station.frame import Decision, Event, Frame, Performance
 COMMAND_LEAD_BLOCKS = 2
 """A command is due this many blocks after the one that led to it: time for it to reach the rig."""
 
+MAX_AHEAD_HZ = 3.0
+"""A jump of the excitation is no sweep: no more of the table than this is retuned ahead of it."""
+
 SETTLE_BLOCKS = 3
 """Blocks not learned from after the controller went on or off."""
 
@@ -118,6 +121,7 @@ class Session:
         self._replaying = recorded_commands is not None
         self._next_command = 1
         self._blocks = 0
+        self._ahead_hz = 0.0
         self._control_on: bool | None = None
         self._since_switch = SETTLE_BLOCKS
         self._status = ""
@@ -167,6 +171,8 @@ class Session:
         estimate = self.observer.advance(block)
         phasors = self._tracker.advance(block) if self._tracker is not None else None
         if phasors is not None:
+            if self._blocks:
+                self._ahead_hz = self._look_ahead(phasors.frequency_hz - self._frequency)
             self._frequency = phasors.frequency_hz
         curve = self._learn(block, phasors, events)
         proposal, decision, command = self._retune(block, phasors, curve, events)
@@ -261,11 +267,12 @@ class Session:
         amplitude = abs(phasors.amplitude[self._names.index(phasors.reference)])
         self._passive_and_limit = self._bounds(retuner, plant, f, amplitude)
         reach = self.settings.goal.reach_hz
-        near = schedule.frequency_hz[0] - reach <= f <= schedule.frequency_hz[-1] + reach
+        low, high = sorted((f, f + self._ahead_hz))
+        near = low - reach <= schedule.frequency_hz[-1] and schedule.frequency_hz[0] <= high + reach
         if curve.status == "unestimated" or not near:
             return None, None, None
         last = block.end_sample - 1
-        proposal = retuner.propose(last, plant, learner.std_at(f), f, amplitude, schedule)
+        proposal = retuner.propose(last, plant, learner.std_at(f), f, amplitude, schedule, self._ahead_hz)
         if proposal.reason:
             events.append(Event(last, "warning", f"retuning: {proposal.reason}"))
         if not proposal.feasible:
@@ -282,6 +289,11 @@ class Session:
         if not self._replaying:
             self.commands[command.command_id] = command
         return proposal, Decision(last, True, "automatic", "verified and better"), command
+
+    def _look_ahead(self, moved_hz: float) -> float:
+        """How far the excitation moves until the proposal after this one takes effect [Hz]."""
+        blocks = self.settings.retune_every_blocks + COMMAND_LEAD_BLOCKS + 1
+        return min(max(moved_hz * blocks, -MAX_AHEAD_HZ), MAX_AHEAD_HZ)
 
     def _worth_it(self, schedule: GainSchedule, proposal: Proposal) -> bool:
         columns = ("alpha_kg", "beta_ns_m", "gamma_n_m")
