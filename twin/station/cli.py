@@ -1,11 +1,12 @@
 """The command line: ``atmd``."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -34,8 +35,17 @@ JsonOption = Annotated[
 ]
 
 
+class Interrupted(BaseException):
+    """The person pressed Ctrl-C. Its own kind: the command-line library ends silently on KeyboardInterrupt."""
+
+
+def _interrupt(_signal: int, _frame: object) -> NoReturn:
+    raise Interrupted
+
+
 def main() -> None:
     """Run a command; what the person's input or the rig did wrong ends in one message, not a traceback."""
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -44,7 +54,7 @@ def main() -> None:
     except RunError as error:
         _complain(error)
         sys.exit(EXIT_RUN)
-    except KeyboardInterrupt:
+    except Interrupted:
         people.print("interrupted; what was recorded until here can be read", style="yellow")
         sys.exit(EXIT_INTERRUPTED)
 
