@@ -35,6 +35,7 @@ class GainProgram:
     def __init__(self, rows: int, scale: Array, bounds: Array) -> None:
         self._rows, self._scale = rows, scale
         self._bounds = bounds / scale[:, None]
+        self._multipliers = np.zeros(rows + 3)
         self._solver: osqp.OSQP | None = None
 
     def solve(
@@ -60,6 +61,8 @@ class GainProgram:
         RunError
             If the solver finds no gains with that margin.
         """
+        if target == 0.0:
+            return np.zeros(3)
         phi = fit * self._scale / abs(target)
         wanted = target / abs(target)
         scaled = terms * self._scale
@@ -74,6 +77,7 @@ class GainProgram:
         hessian = 2.0 * (stacked.T @ stacked + PROXIMAL * np.eye(3))
         pull = -2.0 * stacked.T @ np.array([wanted.real, wanted.imag])
         y = np.linalg.solve(basis, start / self._scale)
+        self._multipliers = np.zeros(self._rows + 3)  # those of the last question would colour this answer
         for _ in range(ROUNDS):
             one_plus = 1.0 + scaled @ y
             turn = np.exp(-1j * np.angle(one_plus))
@@ -104,15 +108,16 @@ class GainProgram:
             self._solver = osqp.OSQP()
             self._solver.setup(
                 P, linear, A, lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=4_000,
-                rho=RHO, adaptive_rho=False,  # adapted by the clock it would not be repeatable
+                rho=RHO, scaling=0, adaptive_rho=False,  # both would carry bits of one question into the next
             )  # fmt: skip
-        else:
-            self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
-        self._solver.warm_start(x=warm)
+        # Also after setup, so that the first question is answered to the same bits as when it is asked again.
+        self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
+        self._solver.warm_start(x=warm, y=self._multipliers)
         result = self._solver.solve(raise_error=False)
         if result.info.status_val not in (
             osqp.SolverStatus.OSQP_SOLVED,
             osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
         ):
             raise RunError(f"no gains keep the margin ({result.info.status})")
+        self._multipliers = np.asarray(result.y, dtype=np.float64)
         return np.asarray(result.x, dtype=np.float64)

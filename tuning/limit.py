@@ -55,6 +55,8 @@ class LimitProblem:
         self._problem = cp.Problem(objective, list(self._constraints.values()))
         if not self._problem.is_dcp(dpp=True):
             raise RuntimeError("the limit problem lost its DPP form")
+        # The first solve compiles, and rounds its last bit otherwise than those after it: get it over with.
+        self.solve((1.0, 1.0), (1.0, 0.0), (1.0, 0.0), CoilLimits(1.0, 1.0, 1.0, 1.0))
 
     def solve(
         self,
