@@ -17,12 +17,13 @@ import rerun as rr
 from frames import BUDGET_W, RATE, channels, frames, schedule
 from rerun.chunk import RrdReader
 
+from estimators.health import model_health
 from twin.plant.config import Plant
 from twin.plant.files import load_plant
 from twin.station.curve_plot import HEIGHT, WIDTH, Axes, axes_for
 from twin.station.frame import Frame
 from twin.station.live import LiveView
-from twin.station.rerun_view import RerunView, describe, model_health
+from twin.station.rerun_view import RerunView, describe
 
 Rows = dict[str, list[tuple[float, object]]]
 

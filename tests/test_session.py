@@ -166,6 +166,22 @@ def test_dead_sensor_freezes_the_learner_and_nothing_is_nan() -> None:
     np.testing.assert_array_equal(before, after)
 
 
+def test_a_rig_that_is_not_the_model_is_called_so_with_the_channel_that_says_it() -> None:
+    programme = demo_programme(20.0, 7)
+    rig = SimulatedRig(programme)
+    session = session_for(programme, rig.channels, TuningGoal())
+    texts = []
+    for k, block in enumerate(blocks_of(rig, 16)):
+        values = block.values.copy()
+        if k >= 10:
+            values[:, 0] *= 1.3  # the table's accelerometer loses its calibration
+        frame = session.advance(make_block(block.first_sample, block.sample_rate_hz, values, block.channels))
+        texts += [(k, e.level, e.text) for e in frame.events if e.text.startswith("model")]
+    assert [k for k, _, _ in texts][:1] == [10]
+    assert texts[0][1] == "warning"
+    assert "table_acceleration" in texts[0][2]
+
+
 def test_lost_blocks_are_bridged() -> None:
     programme = demo_programme(20.0, 7)
     rig = SimulatedRig(programme)

@@ -19,6 +19,10 @@ class Event:
     text: str
 
 
+UNCHANGED = "too small a change"
+"""Reason of a decision that is kept but not worth a person's attention."""
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """What became of a proposal, and who said so."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import rerun as rr
 
+from estimators.health import model_health
 from estimators.types import StateEstimate
 from twin.control.schedule import Command, GainSchedule
 from twin.plant.blocks import Channel
@@ -18,12 +19,9 @@ from twin.station import palette
 from twin.station.blueprint import Layout, blueprint
 from twin.station.columns import TIMELINE, Columns, nanoseconds
 from twin.station.curve_plot import Axes, axes_for, log_axes, log_curve
-from twin.station.frame import Frame
+from twin.station.frame import UNCHANGED, Frame
 
 SHOWN_HZ = 1000.0
-# Mean NIS over a block is 1 for a consistent filter; these bounds leave room for its scatter over a block.
-NIS_AGREES, NIS_DRIFTS = (0.5, 2.0), (0.25, 4.0)
-
 _CURVE_PERIOD_S = 0.5
 _MICRO, _MILLI = 1e6, 1e3
 
@@ -226,7 +224,7 @@ class RerunView:
             self._say(
                 event.sample / rate, event.text, {"warning": "WARN"}.get(event.level, event.level.upper())
             )
-        if frame.decision is not None:
+        if frame.decision is not None and frame.decision.reason != UNCHANGED:
             d = frame.decision
             word = "accepted" if d.accepted else "declined"
             self._say(d.sample / rate, f"proposal {word} ({d.by}): {d.reason}", "INFO")
@@ -273,7 +271,7 @@ class RerunView:
         _lines(
             stream,
             "power",
-            ["electrical mean [W]", "Joule mean [W]", "Joule peak [W]", "budget [W]"],
+            ["electrical mean [W]", "Joule mean [W]", "Joule peak [W]", "budget (Joule mean) [W]"],
             [palette.MEASURED, palette.TWIN, palette.SERIES[2], palette.LIMIT],
             [2.0, 2.0, 1.5, 2.5],
         )
@@ -320,15 +318,6 @@ class RerunView:
                 "no data": palette.OFF,
             },
         )
-
-
-def model_health(nis: float) -> str:
-    """Word for how well model and rig agree, from the block's mean NIS: agrees, drifts, disagrees, no data."""
-    if not np.isfinite(nis):
-        return "no data"
-    if NIS_AGREES[0] <= nis <= NIS_AGREES[1]:
-        return "agrees"
-    return "drifts" if NIS_DRIFTS[0] <= nis <= NIS_DRIFTS[1] else "disagrees"
 
 
 def describe(plant: Plant) -> str:

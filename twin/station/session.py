@@ -8,12 +8,13 @@ on nothing else, so that a replay repeats it.
 
 import math
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from estimators.damping import AbsorberBalance, DampingLearner, LearnerSettings
 from estimators.excitation import ExcitationTracker, choose_reference
+from estimators.health import model_health
 from estimators.observer import Observer
 from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.loop import LoopFacts, RigModel
@@ -25,7 +26,7 @@ from twin.plant.config import Plant, VoiceCoil
 from twin.plant.errors import InputError, RunError
 from twin.plant.inputs import DriveReader, driven_model
 from twin.plant.parallel import ParallelPlant
-from twin.station.frame import Decision, Event, Frame, Performance
+from twin.station.frame import UNCHANGED, Decision, Event, Frame, Performance
 
 COMMAND_LEAD_BLOCKS = 2
 """A command is due this many blocks after the one that led to it: time for it to reach the rig."""
@@ -124,7 +125,7 @@ class Session:
         self._ahead_hz = 0.0
         self._control_on: bool | None = None
         self._since_switch = SETTLE_BLOCKS
-        self._status = ""
+        self._status = self._health = ""
         self._passive_and_limit = (math.nan, math.nan)
 
     def _start_learning(self, names: tuple[str, ...]) -> None:
@@ -169,6 +170,7 @@ class Session:
         self._refresh_model()
         twin = self._parallel.advance(block)[:, self._parallel_rows]
         estimate = self.observer.advance(block)
+        self._note_health(block, estimate, events)
         phasors = self._tracker.advance(block) if self._tracker is not None else None
         if phasors is not None:
             if self._blocks:
@@ -215,6 +217,18 @@ class Session:
             names = [c.name for i, c in enumerate(self.channels) if not block.valid[:, i].all()]
             events.append(Event(first, "warning", f"{masked} samples masked in {', '.join(names)}"))
         return events
+
+    def _note_health(self, block: Block, estimate: StateEstimate, events: list[Event]) -> None:
+        health = model_health(estimate.nis)
+        if health == self._health:
+            return
+        if self._health or health != "agrees":
+            level: Literal["info", "warning"] = "info" if health == "agrees" else "warning"
+            ratio = estimate.innovation_rms / estimate.innovation_std
+            worst = estimate.sensors[int(np.nanargmax(ratio))] if np.isfinite(ratio).any() else "no sensor"
+            text = f"model {health} with the rig (NIS {estimate.nis:.2f}, most in {worst})"
+            events.append(Event(block.end_sample - 1, level, text if health != "no data" else "no data"))
+        self._health = health
 
     def _learn(self, block: Block, phasors: Phasors | None, events: list[Event]) -> DampingCurve | None:
         if self._learner is None or self._balance is None:
@@ -279,7 +293,7 @@ class Session:
             return proposal, Decision(last, False, "automatic", proposal.reason), None
         points = {row: point.gains for row, point in proposal.points}
         if not self._worth_it(schedule, proposal):
-            return proposal, Decision(last, False, "automatic", "too small a change"), None
+            return proposal, Decision(last, False, "automatic", UNCHANGED), None
         command = Command(
             command_id=self._next_command,
             apply_at_sample=block.end_sample + COMMAND_LEAD_BLOCKS * block.n_samples,
