@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
 
+STRETCH = 120
+"""Samples worked on at once where there is no recursion: few enough to stay in the nearest cache."""
+
 
 @kernel
 def full_covariance_block(
@@ -118,6 +121,10 @@ def constant_gain_block(
 ) -> None:
     """Kalman filter with a constant gain, in place; every sample must be valid.
 
+    With e the innovation and s the inputs before, the inputs now and the measurements,
+    ``e = E s - H F x`` and ``x <- (F - K H F) x + W s``: all but the recursion in x has no memory, and is
+    worked out for many samples at once, signals in rows and time along them.
+
     Parameters
     ----------
     gain
@@ -127,39 +134,112 @@ def constant_gain_block(
 
     Others as `full_covariance_block`.
     """
-    n, m, p = F.shape[0], u.shape[1], H.shape[0]
-    fresh, innovation = np.empty(n), np.empty(p)
-    for k in range(z.shape[0]):
+    n, m, p, n_samples = F.shape[0], u.shape[1], H.shape[0], z.shape[0]
+    innovation_of_x, innovation_of_signals = np.zeros((p, n)), np.zeros((p, 2 * m + p))
+    for r in range(p):
         for i in range(n):
-            total = 0.0
             for j in range(n):
-                total += F[i, j] * x[j]
+                innovation_of_x[r, j] -= H[r, i] * F[i, j]
             for j in range(m):
-                total += B0[i, j] * u_before[j] + B1[i, j] * u[k, j]
-            fresh[i] = total
+                innovation_of_signals[r, j] -= H[r, i] * B0[i, j]
+                innovation_of_signals[r, m + j] -= H[r, i] * B1[i, j]
         for j in range(m):
-            u_before[j] = u[k, j]
+            innovation_of_signals[r, m + j] -= D[r, j]
+        innovation_of_signals[r, 2 * m + r] = 1.0
+    columns, drift_of_signals = F.T.copy(), np.zeros((n, 2 * m + p))
+    for i in range(n):
+        for j in range(m):
+            drift_of_signals[i, j], drift_of_signals[i, m + j] = B0[i, j], B1[i, j]
         for r in range(p):
-            total = z[k, r]
-            for i in range(n):
-                total -= H[r, i] * fresh[i]
+            for j in range(n):
+                columns[j, i] += gain[i, r] * innovation_of_x[r, j]
+            for j in range(2 * m + p):
+                drift_of_signals[i, j] += gain[i, r] * innovation_of_signals[r, j]
+
+    signals, drift = np.zeros((2 * m + p, STRETCH)), np.zeros((n, STRETCH))
+    before, innovation = np.zeros((n, STRETCH)), np.zeros((p, STRETCH))
+    products = np.zeros((p, p, STRETCH))
+    for first in range(0, n_samples, STRETCH):
+        count = min(STRETCH, n_samples - first)
+        for k in range(count):
             for j in range(m):
-                total -= D[r, j] * u[k, j]
-            innovation[r] = total
-        for i in range(n):
-            total = fresh[i]
+                signals[j, k], signals[m + j, k] = u_before[j], u[first + k, j]
+                u_before[j] = u[first + k, j]
             for r in range(p):
-                total += gain[i, r] * innovation[r]
-            x[i] = total
-            mean[k, i] = total
+                signals[2 * m + r, k] = z[first + k, r]
+        drift[:] = 0.0
+        innovation[:] = 0.0
+        _add_product(drift_of_signals, signals, drift, count)
+        for i in range(n):
+            before[i, 0] = x[i]
+        _recursion(columns, drift, x, mean, first, count)
+        for k in range(count - 1):
+            for i in range(n):
+                before[i, k + 1] = mean[first + k, i]
+        _add_product(innovation_of_signals, signals, innovation, count)
+        _add_product(innovation_of_x, before, innovation, count)
         for r in range(p):
+            for q in range(r + 1):
+                for k in range(count):
+                    products[r, q, k] += innovation[r, k] * innovation[q, k]
+    for r in range(p):
+        statistics[0, r] += n_samples
+        statistics[2, r] += n_samples * residual_variance[r]
+        for q in range(r + 1):
             total = 0.0
-            for q in range(p):
-                total += residual_inverse[r, q] * innovation[q]
-            statistics[0, r] += 1.0
-            statistics[1, r] += innovation[r] * innovation[r]
-            statistics[2, r] += residual_variance[r]
-            statistics[3, r] += innovation[r] * total
+            for k in range(STRETCH):
+                total += products[r, q, k]
+            statistics[3, r] += residual_inverse[r, q] * total
+            if q == r:
+                statistics[1, r] += total
+            else:
+                statistics[3, q] += residual_inverse[q, r] * total
+
+
+@kernel
+def _add_product(matrix: Array, rows: Array, out: Array, count: int) -> None:
+    """``out += matrix @ rows`` for the first ``count`` columns; the innermost loops run along contiguous time."""
+    n = matrix.shape[1]
+    for r in range(matrix.shape[0]):
+        c = 0
+        while c + 4 <= n:
+            a, b, d, e = matrix[r, c], matrix[r, c + 1], matrix[r, c + 2], matrix[r, c + 3]
+            for k in range(count):
+                out[r, k] += (a * rows[c, k] + b * rows[c + 1, k]) + (d * rows[c + 2, k] + e * rows[c + 3, k])
+            c += 4
+        while c < n:
+            a = matrix[r, c]
+            for k in range(count):
+                out[r, k] += a * rows[c, k]
+            c += 1
+
+
+@kernel
+def _recursion(columns: Array, drift: Array, x: Array, mean: Array, first: int, count: int) -> None:
+    """``x <- columns' x + drift`` sample by sample, in place; ``mean`` receives every x from row ``first`` on.
+
+    Four columns at a time: a sum over columns has independent rows, which processors take several at once.
+    """
+    n = len(x)
+    for k in range(count):
+        row = first + k
+        for i in range(n):
+            mean[row, i] = drift[i, k]
+        j = 0
+        while j + 4 <= n:
+            a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+            for i in range(n):
+                mean[row, i] += (columns[j, i] * a + columns[j + 1, i] * b) + (
+                    columns[j + 2, i] * c + columns[j + 3, i] * d
+                )
+            j += 4
+        while j < n:
+            a = x[j]
+            for i in range(n):
+                mean[row, i] += columns[j, i] * a
+            j += 1
+        for i in range(n):
+            x[i] = mean[row, i]
 
 
 @kernel
