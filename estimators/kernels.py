@@ -121,9 +121,9 @@ def constant_gain_block(
 ) -> None:
     """Kalman filter with a constant gain, in place; every sample must be valid.
 
-    With e the innovation and s the inputs before, the inputs now and the measurements,
-    ``e = E s - H F x`` and ``x <- (F - K H F) x + W s``: all but the recursion in x has no memory, and is
-    worked out for many samples at once, signals in rows and time along them.
+    With e the innovation and v the inputs before and now, ``e = z - G v - H F x`` and
+    ``x <- (F - K H F) x + W (v, z)``: all but the recursion in x has no memory, and is worked out for many
+    samples at once, signals in rows and time along them.
 
     Parameters
     ----------
@@ -135,17 +135,16 @@ def constant_gain_block(
     Others as `full_covariance_block`.
     """
     n, m, p, n_samples = F.shape[0], u.shape[1], H.shape[0], z.shape[0]
-    innovation_of_x, innovation_of_signals = np.zeros((p, n)), np.zeros((p, 2 * m + p))
+    innovation_of_x, innovation_of_inputs = np.zeros((p, n)), np.zeros((p, 2 * m))
     for r in range(p):
         for i in range(n):
             for j in range(n):
                 innovation_of_x[r, j] -= H[r, i] * F[i, j]
             for j in range(m):
-                innovation_of_signals[r, j] -= H[r, i] * B0[i, j]
-                innovation_of_signals[r, m + j] -= H[r, i] * B1[i, j]
+                innovation_of_inputs[r, j] -= H[r, i] * B0[i, j]
+                innovation_of_inputs[r, m + j] -= H[r, i] * B1[i, j]
         for j in range(m):
-            innovation_of_signals[r, m + j] -= D[r, j]
-        innovation_of_signals[r, 2 * m + r] = 1.0
+            innovation_of_inputs[r, m + j] -= D[r, j]
     columns, drift_of_signals = F.T.copy(), np.zeros((n, 2 * m + p))
     for i in range(n):
         for j in range(m):
@@ -153,8 +152,9 @@ def constant_gain_block(
         for r in range(p):
             for j in range(n):
                 columns[j, i] += gain[i, r] * innovation_of_x[r, j]
-            for j in range(2 * m + p):
-                drift_of_signals[i, j] += gain[i, r] * innovation_of_signals[r, j]
+            for j in range(2 * m):
+                drift_of_signals[i, j] += gain[i, r] * innovation_of_inputs[r, j]
+            drift_of_signals[i, 2 * m + r] = gain[i, r]
 
     signals, drift = np.zeros((2 * m + p, STRETCH)), np.zeros((n, STRETCH))
     before, innovation = np.zeros((n, STRETCH)), np.zeros((p, STRETCH))
@@ -166,9 +166,8 @@ def constant_gain_block(
                 signals[j, k], signals[m + j, k] = u_before[j], u[first + k, j]
                 u_before[j] = u[first + k, j]
             for r in range(p):
-                signals[2 * m + r, k] = z[first + k, r]
+                signals[2 * m + r, k] = innovation[r, k] = z[first + k, r]
         drift[:] = 0.0
-        innovation[:] = 0.0
         _add_product(drift_of_signals, signals, drift, count)
         for i in range(n):
             before[i, 0] = x[i]
@@ -176,7 +175,7 @@ def constant_gain_block(
         for k in range(count - 1):
             for i in range(n):
                 before[i, k + 1] = mean[first + k, i]
-        _add_product(innovation_of_signals, signals, innovation, count)
+        _add_product(innovation_of_inputs, signals, innovation, count)
         _add_product(innovation_of_x, before, innovation, count)
         for r in range(p):
             for q in range(r + 1):

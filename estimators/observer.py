@@ -146,8 +146,9 @@ class Observer:
         last valid one, since the model must be driven by something.
         """
         kf = self.filter
-        z = np.ascontiguousarray(block.values[:, self._sensor_columns])
-        valid = np.ascontiguousarray(block.valid[:, self._sensor_columns])
+        z = block.values.take(self._sensor_columns, axis=1)
+        # A look at the whole block is cheap; the sensors' columns matter only if it finds something.
+        whole = bool(block.valid.all()) or bool(block.valid.take(self._sensor_columns, axis=1).all())
         u = self._drive.gather(block)
         if self._u_before is None:
             self._u_before = u[0].copy()
@@ -156,14 +157,15 @@ class Observer:
         statistics = np.zeros((4, len(self.sensors)))  # count, sum of squares, sum of variances, NIS
         m = len(self.sources)
         B0, B1 = np.ascontiguousarray(kf.B[:, :m]), np.ascontiguousarray(kf.B[:, m:])
-        n_full = len(z) if not valid.all() else min(self._full_left, len(z))
+        n_full = min(self._full_left, len(z)) if whole else len(z)
         if n_full:
+            valid = block.valid[:n_full].take(self._sensor_columns, axis=1)
             full_covariance_block(
                 kf.F, B0, B1, kf.H, self.feedthrough, kf.Q, self._variance, x, P, self._u_before,
-                u[:n_full], z[:n_full], valid[:n_full], mean[:n_full], statistics,
+                u[:n_full], z[:n_full], valid, mean[:n_full], statistics,
             )  # fmt: skip
             self._full_left -= n_full
-        if not valid.all():
+        if not whole:
             self._full_left = self._settle_samples
         if n_full < len(z):
             P = np.array(self.steady_covariance)
@@ -172,12 +174,13 @@ class Observer:
                 self._residual_inverse, x, self._u_before, u[n_full:], z[n_full:], mean[n_full:], statistics,
             )  # fmt: skip
         kf.x, kf.P = x[:, None], P
+        mean.flags.writeable = False
         count, squares, expected, nis = statistics
         with np.errstate(invalid="ignore"):
             rms, std = np.sqrt(squares / count), np.sqrt(expected / count)
         return StateEstimate(
             states=self.states,
-            mean=read_only(mean),
+            mean=mean,
             covariance=read_only(P),
             innovation_rms=read_only(rms),
             innovation_std=read_only(std),

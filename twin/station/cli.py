@@ -19,11 +19,10 @@ EXIT_INPUT, EXIT_RUN, EXIT_INTERRUPTED = 2, 3, 130
 
 app = typer.Typer(
     name="atmd",
-    help="Digital twin of an active vibration rig: it runs beside the rig, learns its damping and retunes it.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 people = Console(stderr=True)
@@ -67,13 +66,13 @@ def _complain(error: Exception) -> None:
 @app.command(epilog="Example: atmd demo --headless --seconds 60 --seed 1 --json -")
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=2.0, max=3600.0, help="Duration of the sweep 40 to 60 Hz [s].")
+        float, typer.Option(min=2.0, max=3600.0, help="Duration of the sweep from 40 to 60 Hz, in s.")
     ] = 60.0,
     seed: Annotated[
         int, typer.Option(min=0, help="Sensor noise, and the true damping that is to be learned.")
     ] = 0,
     budget_w: Annotated[
-        float, typer.Option(min=1e-3, help="Mean Joule power the coil may burn, R i_rms² [W].")
+        float, typer.Option(min=1e-3, help="Mean Joule power the coil may burn, R i_rms², in W.")
     ] = 4.0,
     headless: Annotated[
         bool, typer.Option("--headless", help="Open no window; draw a picture at the end.")
@@ -100,13 +99,18 @@ def demo(
     damping_rmse_ns_m (learned against true, 45 to 55 Hz), blocks, dropped, realtime_factor (time of data over time
     in the loop), recording, picture.
     """
-    from twin.station.demo import DemoOptions, run_demo
+    from twin.station.demo import SWEEP_HZ, DemoOptions, run_demo
     from twin.station.outputs import has_display
 
     _must_be_rrd(save)
+    _must_be_writable(json_to)
     recording = save if save is not None else Path("runs") / "demo.rrd"
     window = not headless and not web and has_display()
     options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed)
+    _say(
+        f"Simulated rig, thesis Test 3: {SWEEP_HZ[0]:g} to {SWEEP_HZ[1]:g} Hz in {seconds:g} s; "
+        f"recording to {recording}"
+    )
     with _bar("demo") as progress:
         result = run_demo(options, _say, progress, _wait_for_browser if web else None)
     if not window and not web and result["blocks"]:
@@ -136,7 +140,7 @@ def replay(
     ] = None,
     sample_rate: Annotated[
         float | None,
-        typer.Option(min=1e-6, metavar="HZ", help="Sample rate of an .npz [Hz], if it does not say."),
+        typer.Option(min=1e-6, metavar="HZ", help="Sample rate of an .npz in Hz, if it does not say."),
     ] = None,
     sidecar: Annotated[
         Path | None,
@@ -161,6 +165,7 @@ def replay(
     from twin.station.replay import ReplayOptions, run_replay
 
     _must_be_rrd(save)
+    _must_be_writable(json_to)
     if view and not has_display():
         raise InputError(
             "--view: this machine has no display; use --web, or --save FILE.rrd and open that elsewhere"
@@ -215,6 +220,24 @@ def doctor(json_to: JsonOption = None) -> None:
     checks = run_checks()
     _report(as_json(checks), lambda _: as_table(checks), json_to)
     raise typer.Exit(exit_code(checks))
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"atmd-twin {version('atmd-twin')}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _top(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Digital twin of an active vibration rig: it runs beside the rig, learns its damping and retunes it."""
 
 
 def _say(line: str) -> None:
@@ -329,6 +352,17 @@ def _channel_options(options: list[str]) -> dict[str, str]:
 def _must_be_rrd(path: Path | None) -> None:
     if path is not None and path.suffix.lower() != ".rrd":
         raise InputError(f"--save {path}: a recording's name ends in .rrd")
+
+
+def _must_be_writable(json_to: str | None) -> None:
+    """Say now, not after the run, that its figures could not be written."""
+    if json_to is None or json_to == "-":
+        return
+    path = Path(json_to)
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise InputError(
+            f"--json {json_to}: cannot be written; give a file in a folder that exists, or - for standard output"
+        )
 
 
 def _viewer_command(recording: Path) -> str:
