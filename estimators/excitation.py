@@ -17,6 +17,9 @@ from twin.plant.config import Plant, Shaker
 from twin.plant.linear import Array, ComplexArray
 
 MIN_VALID_SHARE = 0.5
+MIN_CYCLES = 1.5
+"""Cycles of the excitation a block must hold: with fewer its frequency, offset and drift look alike."""
+
 LOST_SIGNAL_RATIO = 5.0
 """Amplitude over its standard deviation below which a reference tells no frequency."""
 
@@ -78,10 +81,14 @@ class ExcitationTracker:
         t_used = t if rows.all() else t[rows]
         half = 0.5 * n * dt
         signal = values[:, self._column]
+        band = (max(self._band[0], MIN_CYCLES / (n * dt)), min(self._band[1], 0.45 / dt))
 
         searching = self._frequency is None
         if self._frequency is None:
-            self._frequency, self._rate, self._age = self._search(signal, dt), 0.0, 0
+            strongest = _search(signal, dt, (self._band[0], band[1]))
+            if strongest < band[0]:
+                return None
+            self._frequency, self._rate, self._age = strongest, 0.0, 0
         f_mid = self._frequency + self._rate * half
         phase_mid = self._phase + math.tau * (self._frequency + 0.5 * self._rate * half) * half
         fit = None
@@ -92,6 +99,9 @@ class ExcitationTracker:
                 break
             correction = (slope / amplitude).imag / math.tau
             f_mid += float(np.clip(correction, -0.5 / half, 0.5 / half))
+        if not band[0] <= f_mid <= band[1]:
+            self._frequency = None
+            return None
         amplitude_, slope_, variance, slope_variance = _fit(t_used, values, phase_mid, f_mid, self._rate)
         a_ref = complex(amplitude_[self._column])
         if abs(a_ref) ** 2 <= LOST_SIGNAL_RATIO**2 * variance[self._column]:
@@ -125,17 +135,18 @@ class ExcitationTracker:
             self._phase = math.remainder(self._phase, math.tau)
             self._frequency += self._rate * duration_s
 
-    def _search(self, signal: Array, dt: float) -> float:
-        """Strongest frequency in the band [Hz], from a Hann-windowed, zero-padded spectrum."""
-        n = len(signal)
-        windowed = (signal - signal.mean()) * np.hanning(n)
-        size = 1 << max(14, (8 * n - 1).bit_length())
-        spectrum = np.abs(np.fft.rfft(windowed, size))
-        frequency = np.fft.rfftfreq(size, dt)
-        inside = (frequency >= self._band[0]) & (frequency <= min(self._band[1], 0.45 / dt))
-        if not inside.any():
-            inside = frequency > 0.0
-        return float(frequency[inside][np.argmax(spectrum[inside])])
+
+def _search(signal: Array, dt: float, band_hz: tuple[float, float]) -> float:
+    """Strongest frequency in the band [Hz], from a Hann-windowed, zero-padded spectrum."""
+    n = len(signal)
+    windowed = (signal - signal.mean()) * np.hanning(n)
+    size = 1 << max(14, (8 * n - 1).bit_length())
+    spectrum = np.abs(np.fft.rfft(windowed, size))
+    frequency = np.fft.rfftfreq(size, dt)
+    inside = (frequency >= band_hz[0]) & (frequency <= band_hz[1])
+    if not inside.any():
+        inside = frequency > 0.0
+    return float(frequency[inside][np.argmax(spectrum[inside])])
 
 
 def _fit(

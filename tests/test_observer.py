@@ -171,7 +171,8 @@ def test_invalid_samples_are_skipped_as_if_never_taken(share: float, seed: int) 
     assert relative_covariance(estimate.covariance, oracle.P) <= 1e-7
 
 
-def test_force_that_an_accelerometer_feels_at_once_is_fed_through() -> None:
+@pytest.mark.parametrize("full_samples", [0, 10**9])
+def test_force_that_an_accelerometer_feels_at_once_is_fed_through(full_samples: int) -> None:
     # a = (f - c v - k x)/m: without D u the innovation would hold the whole force.
     plant = Plant(
         name="mass",
@@ -181,6 +182,7 @@ def test_force_that_an_accelerometer_feels_at_once_is_fed_through() -> None:
     )
     observer = Observer(plant, ("a", "push"), 1000.0)
     assert observer.feedthrough == pytest.approx(np.array([[1.0 / plant.body[0].mass_kg]]))
+    observer._full_left = full_samples  # both kernels
     u = np.where(np.arange(400) % 40 < 20, 5.0, -5.0)[:, None]
     _, z = model_data(observer, u, seed=4)
     expected = by_filterpy(oracle_of(observer), observer.feedthrough, u, z)
@@ -239,6 +241,21 @@ def test_white_force_shakes_a_free_mass_as_an_integrated_wiener_process() -> Non
     q, dt = (0.5 / 2.0) ** 2 / 2.0, 0.01
     Q = van_loan(np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, q]), dt)
     np.testing.assert_allclose(Q, q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), rtol=1e-9)
+
+
+def test_disturbances_enter_with_half_their_one_sided_density() -> None:
+    plant = load_plant("engine")
+    observer = Observer(
+        plant, ("case_displacement",), 1000.0, disturbances=Disturbances(force_n=3.0, voltage_v=0.2)
+    )
+    for row, body in enumerate(plant.body):
+        # Over a sample short against the body's period the velocity walks by S²/2 dt/m².
+        walked = 3.0**2 / 2.0 / 1000.0 / body.mass_kg**2
+        assert observer.filter.Q[2 + row, 2 + row] == pytest.approx(walked, rel=0.15)
+    rig = Observer(load_plant("rig"), DRIVEN, 5e6, frequency_hz=50.0, disturbances=Disturbances(0.0, 0.2))
+    row = rig.states.index("i_shaker")
+    measured = (1e-5**2 * 5e6 / 2.0) * np.sum(rig.filter.B[row, [1, 3]] ** 2)
+    assert rig.filter.Q[row, row] - measured == pytest.approx(0.2**2 / 2.0 / 5e6 / 0.0018**2, rel=1e-3)
 
 
 def test_noise_of_a_measured_drive_enters_as_uncertainty_of_the_state() -> None:
