@@ -54,8 +54,8 @@ docs-coverage: $(VENV)/.dev ## Every public thing has a docstring
 
 check: lint types contracts docs-coverage ## lint, types, contracts, docs-coverage
 
-bench: $(VENV)/.dev $(VENV)/.project ## Speed, measured against the reference libraries side by side
-	$(BIN)/python -m pytest benchmarks $(ARGS)
+bench: $(VENV)/.dev $(VENV)/.project ## Speed, measured against the reference libraries side by side (ARGS="observer --json -")
+	$(BIN)/python -m benchmarks $(ARGS)
 
 LOCK = $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --no-header $(ARGS)

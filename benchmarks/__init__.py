@@ -1,0 +1,1 @@
+"""How fast the program is, against the reference libraries, side by side in one run."""

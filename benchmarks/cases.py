@@ -1,0 +1,21 @@
+"""The cases by name, in their usual setting and in a tiny one that only shows that they work."""
+
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks import chain, filters, observer, plant, retune
+from benchmarks.report import Report
+
+CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
+    "observer": (observer.run_observer, observer.Setting(), observer.SMALL),
+    "plant": (plant.run_plant, plant.Setting(), plant.SMALL),
+    "filters": (filters.run_filters, filters.Setting(), filters.SMALL),
+    "chain": (chain.run_chain, chain.Setting(), chain.SMALL),
+    "retune": (retune.run_retune, retune.Setting(), retune.SMALL),
+}
+
+
+def run_case(name: str, *, small: bool = False) -> Report:
+    """Run one case."""
+    run, usual, tiny = CASES[name]
+    return run(tiny if small else usual)

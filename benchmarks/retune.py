@@ -1,0 +1,81 @@
+"""Retuning one operating point: the limit, the gains, and the verification."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.report import Report, Row
+from tuning.gains import GainProgram
+from tuning.loop import LoopFacts
+from tuning.retune import Retuner, TuningGoal
+from twin.plant.config import DampingTable
+from twin.plant.linear import Array
+from twin.station.demo import DRIVE_V, demo_programme
+
+WANTED_P99_MS = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How many proposals are timed."""
+
+    proposals: int = 300
+
+
+SMALL = Setting(proposals=5)
+
+
+def run_retune(setting: Setting) -> Report:
+    """Median and 99th percentile of one point's proposal, and of the quadratic programs in it."""
+    programme = demo_programme(10.0, seed=0)
+    plant, absorber = programme.plant, programme.plant.absorber
+    if absorber is None:
+        raise ValueError("the rig has no absorber")
+    facts = LoopFacts(programme.sample_rate_hz, programme.loop_delay_samples)
+    retuner = Retuner(plant, facts, TuningGoal(reach_hz=0.2))
+    programs: list[float] = []
+    solve = GainProgram.solve
+
+    def timed(*arguments: Any) -> Array:
+        began = time.perf_counter()
+        try:
+            return solve(*arguments)
+        finally:
+            programs.append(1e3 * (time.perf_counter() - began))
+
+    rng = np.random.default_rng(4)
+    taken, feasible = [], 0
+    GainProgram.solve = timed  # type: ignore[method-assign]
+    try:
+        for k in range(setting.proposals + 3):
+            # Another damping and frequency each time, so that nothing is known from before.
+            c2 = float(rng.uniform(4.0, 15.0))
+            frequency = float(rng.choice(programme.schedule.frequency_hz))
+            table = DampingTable(frequency_hz=(40.0, 60.0), ns_m=(c2, c2))
+            now = plant.with_damping(absorber.name, table)
+            began = time.perf_counter()
+            proposal = retuner.propose(0, now, 0.1, frequency, DRIVE_V, programme.schedule)
+            if k >= 3:
+                taken.append(1e3 * (time.perf_counter() - began))
+                feasible += proposal.feasible
+            else:
+                programs.clear()
+    finally:
+        GainProgram.solve = solve  # type: ignore[method-assign]
+    low, median, high, late = np.percentile(taken, [25.0, 50.0, 75.0, 99.0])
+    figures = {
+        "median_ms": float(median),
+        "p99_ms": float(late),
+        "qp_ms": float(np.median(programs)),
+        "proposals": setting.proposals,
+        "feasible": feasible,
+    }
+    spread = float(0.5 * (high - low) / median)
+    rows = [
+        Row("retuning one point, median", float(median), "ms", spread=spread),
+        Row("retuning one point, 99th percentile", float(late), "ms", WANTED_P99_MS, "less"),
+        Row("  of it the quadratic programs, median", figures["qp_ms"], "ms"),
+    ]
+    return Report({"retune": figures}, rows)
