@@ -47,7 +47,7 @@ def run_retune(setting: Setting) -> Report:
 
     rng = np.random.default_rng(4)
     taken, feasible = [], 0
-    GainProgram.solve = timed  # type: ignore[method-assign]
+    GainProgram.solve = timed  # type: ignore[assignment, method-assign]
     try:
         for k in range(setting.proposals + 3):
             # Another damping and frequency each time, so that nothing is known from before.
