@@ -5,9 +5,7 @@ from numpy.typing import NDArray
 
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
-
-STRETCH = 120
-"""Samples worked on at once where there is no recursion: few enough to stay in the nearest cache."""
+from twin.plant.stretches import STRETCH, add_product, recursion
 
 
 @kernel
@@ -168,15 +166,15 @@ def constant_gain_block(
             for r in range(p):
                 signals[2 * m + r, k] = innovation[r, k] = z[first + k, r]
         drift[:] = 0.0
-        _add_product(drift_of_signals, signals, drift, count)
+        add_product(drift_of_signals, signals, drift, count)
         for i in range(n):
             before[i, 0] = x[i]
-        _recursion(columns, drift, x, mean, first, count)
+        recursion(columns, drift, x, mean, first, count)
         for k in range(count - 1):
             for i in range(n):
                 before[i, k + 1] = mean[first + k, i]
-        _add_product(innovation_of_inputs, signals, innovation, count)
-        _add_product(innovation_of_x, before, innovation, count)
+        add_product(innovation_of_inputs, signals, innovation, count)
+        add_product(innovation_of_x, before, innovation, count)
         for r in range(p):
             for q in range(r + 1):
                 for k in range(count):
@@ -193,52 +191,6 @@ def constant_gain_block(
                 statistics[1, r] += total
             else:
                 statistics[3, q] += residual_inverse[q, r] * total
-
-
-@kernel
-def _add_product(matrix: Array, rows: Array, out: Array, count: int) -> None:
-    """``out += matrix @ rows`` for the first ``count`` columns; the innermost loops run along contiguous time."""
-    n = matrix.shape[1]
-    for r in range(matrix.shape[0]):
-        c = 0
-        while c + 4 <= n:
-            a, b, d, e = matrix[r, c], matrix[r, c + 1], matrix[r, c + 2], matrix[r, c + 3]
-            for k in range(count):
-                out[r, k] += (a * rows[c, k] + b * rows[c + 1, k]) + (d * rows[c + 2, k] + e * rows[c + 3, k])
-            c += 4
-        while c < n:
-            a = matrix[r, c]
-            for k in range(count):
-                out[r, k] += a * rows[c, k]
-            c += 1
-
-
-@kernel
-def _recursion(columns: Array, drift: Array, x: Array, mean: Array, first: int, count: int) -> None:
-    """``x <- columns' x + drift`` sample by sample, in place; ``mean`` receives every x from row ``first`` on.
-
-    Four columns at a time: a sum over columns has independent rows, which processors take several at once.
-    """
-    n = len(x)
-    for k in range(count):
-        row = first + k
-        for i in range(n):
-            mean[row, i] = drift[i, k]
-        j = 0
-        while j + 4 <= n:
-            a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
-            for i in range(n):
-                mean[row, i] += (columns[j, i] * a + columns[j + 1, i] * b) + (
-                    columns[j + 2, i] * c + columns[j + 3, i] * d
-                )
-            j += 4
-        while j < n:
-            a = x[j]
-            for i in range(n):
-                mean[row, i] += columns[j, i] * a
-            j += 1
-        for i in range(n):
-            x[i] = mean[row, i]
 
 
 @kernel

@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array, LinearModel, read_only
+from twin.plant.stretches import STRETCH, add_product, recursion
 
 Hold = Literal["zoh", "foh"]
 
@@ -76,24 +77,27 @@ def simulate_block(
     y
         (N, p) receives the outputs.
     """
-    n, m, p = F.shape[0], u.shape[1], C.shape[0]
-    fresh = np.empty(n)
-    for k in range(u.shape[0]):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += F[i, j] * x[j]
+    n, m, p, n_samples = F.shape[0], u.shape[1], C.shape[0], u.shape[0]
+    B = np.empty((n, 2 * m))
+    B[:, :m], B[:, m:] = B0, B1
+    columns, state = F.T.copy(), np.empty((STRETCH, n))
+    inputs, now, drift = np.zeros((2 * m, STRETCH)), np.zeros((m, STRETCH)), np.zeros((n, STRETCH))
+    states, outputs = np.zeros((n, STRETCH)), np.zeros((p, STRETCH))
+    for first in range(0, n_samples, STRETCH):
+        count = min(STRETCH, n_samples - first)
+        for k in range(count):
             for j in range(m):
-                total += B0[i, j] * u_before[j] + B1[i, j] * u[k, j]
-            fresh[i] = total
-        for i in range(n):
-            x[i] = fresh[i]
-        for j in range(m):
-            u_before[j] = u[k, j]
-        for i in range(p):
-            total = 0.0
-            for j in range(n):
-                total += C[i, j] * x[j]
-            for j in range(m):
-                total += D[i, j] * u[k, j]
-            y[k, i] = total
+                inputs[j, k], inputs[m + j, k], now[j, k] = u_before[j], u[first + k, j], u[first + k, j]
+                u_before[j] = u[first + k, j]
+        drift[:] = 0.0
+        outputs[:] = 0.0
+        add_product(B, inputs, drift, count)
+        recursion(columns, drift, x, state, 0, count)
+        for k in range(count):
+            for i in range(n):
+                states[i, k] = state[k, i]
+        add_product(C, states, outputs, count)
+        add_product(D, now, outputs, count)
+        for k in range(count):
+            for i in range(p):
+                y[first + k, i] = outputs[i, k]
