@@ -223,6 +223,20 @@ def test_gain_frozen_after_a_model_change_is_within_a_millionth_of_the_exact_fil
     assert relative_covariance(observer.filter.P, oracle.P) <= 1e-3
 
 
+def test_after_a_gap_the_full_covariance_takes_over_again() -> None:
+    observer = rig_observer()
+    u = drives(1500)
+    _, z = model_data(observer, u, seed=7)
+    valid = np.ones(z.shape, dtype=bool)
+    valid[600:900] = False
+    expected = by_filterpy(oracle_of(observer), observer.feedthrough, u, z, valid)
+    means = [
+        observer.advance(b).mean
+        for b in blocks_of(rig_values(u, np.where(valid, z, np.nan)), DRIVEN, RATE_HZ, [500, 1000, 1200])
+    ]
+    assert relative(np.concatenate(means)[:1200], expected[:1200]) <= 1e-8
+
+
 # --- process noise ------------------------------------------------------------------------------------------
 
 
