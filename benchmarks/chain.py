@@ -133,6 +133,10 @@ def run_chain(setting: Setting) -> Report:
         low, median, high = np.percentile(every * programme.block_s / rounds, [25.0, 50.0, 75.0])
         figures[f"realtime_factor_{mode}"] = float(median)
         rows.append(Row(WHAT[mode], float(median), "x", wanted, spread=float(0.5 * (high - low) / median)))
+    # Most blocks bring no retuning, so that the median block is one without.
+    between = programme.block_s / float(np.median(taken["steady"]))
+    figures["realtime_factor_between_retunings"] = between
+    rows.append(Row("chain, steady state, blocks without retuning", between, "x"))
     measured_s = (len(blocks) - skip) * programme.block_s
     figures["stage_share_of_real_time"] = {
         name: stages.get(name, 0.0) / measured_s for name in (*STAGES, "recording and view")
