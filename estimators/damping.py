@@ -108,6 +108,8 @@ class LearnerSettings:
         No single block is believed better than this: phase of sensors, curvature between knots.
     transient_std_ns
         And by so much less the faster its amplitudes move [Ns/m per 1/s].
+    floor_std_n_m
+        The stiffness is not believed better than this, however many blocks agree [N/m].
     rate_limit_ns_m_s
         How fast the value in use follows the learned one.
     max_block_std_ns_m, max_transient_1_s
@@ -124,6 +126,7 @@ class LearnerSettings:
     forgetting_ns_m_sqrt_s: float = 0.05
     floor_std_ns_m: float = 0.03
     transient_std_ns: float = 0.3
+    floor_std_n_m: float = 5.0
     rate_limit_ns_m_s: float = 5.0
     max_block_std_ns_m: float = 1.0
     max_transient_1_s: float = 1.0
@@ -153,6 +156,7 @@ class DampingLearner:
         self._accepted = self._strays = 0
         self._reason = "nothing measured yet"
         self._stiffness, self._stiffness_variance = math.nan, math.inf
+        self._stiffness_weight = self._stiffness_scatter = 0.0
 
     def advance(self, balance: ForceBalance | None, elapsed_s: float, objection: str = "") -> DampingCurve:
         """Take one block in, unless a gate objects, and move the value in use.
@@ -205,6 +209,19 @@ class DampingLearner:
         h = self._weights(frequency_hz)
         return math.sqrt(max(float(h @ self._covariance @ h), 0.0))
 
+    def _take_stiffness(self, balance: ForceBalance) -> None:
+        """Weighted mean of the blocks' stiffness; its scatter from block to block says how well it is known."""
+        noise = balance.stiffness_std_n_m**2 + (self.settings.floor_std_n_m**2)
+        previous = self._stiffness if self._accepted else balance.stiffness_n_m
+        innovation = balance.stiffness_n_m - previous
+        self._stiffness_weight += 1.0 / noise
+        step = innovation / (noise * self._stiffness_weight)
+        self._stiffness = previous + step
+        self._stiffness_scatter += innovation * (innovation - step) / noise
+        # Blocks disagree by more than their noise: model error, shared by neighbours, does not average away.
+        excess = max(1.0, self._stiffness_scatter / max(self._accepted, 1))
+        self._stiffness_variance = excess * (1.0 / self._stiffness_weight + self.settings.floor_std_n_m**2)
+
     def _status(self) -> DampingStatus:
         if not np.all(np.isfinite(self._mean)):
             return "invalid"
@@ -239,10 +256,7 @@ class DampingLearner:
         self._covariance += np.diag(h * settings.forgetting_ns_m_sqrt_s**2 * elapsed_s)
         scalar_update(self._mean, self._covariance, h, self._variance(balance), balance.damping_ns_m)
         self._covariance = 0.5 * (self._covariance + self._covariance.T)
-        weight, old = 1.0 / balance.stiffness_std_n_m**2, 1.0 / self._stiffness_variance
-        previous = self._stiffness if self._accepted else 0.0
-        self._stiffness = (old * previous + weight * balance.stiffness_n_m) / (old + weight)
-        self._stiffness_variance = 1.0 / (old + weight)
+        self._take_stiffness(balance)
         self._accepted += 1
 
     def _variance(self, balance: ForceBalance) -> float:

@@ -23,6 +23,9 @@ from twin.plant.linear import Array, LinearModel, read_only
 
 OBSERVED_KINDS = ("displacement", "velocity", "acceleration", "current")
 
+SETTLED = 1e-4
+"""Variances this near to the steady ones, relative, count as steady."""
+
 
 @dataclass(frozen=True, slots=True)
 class Disturbances:
@@ -54,8 +57,9 @@ class Observer:
     frequency_hz
         Where damping against frequency is read at the start [Hz].
     settle_samples
-        Samples of full covariance after a model change, before the gain is frozen. After so many samples the
-        frozen filter is within 1e-7 of the exact one; a block with an invalid sample never runs frozen.
+        The full covariance runs in stretches of this many samples until, at the end of one, every variance is
+        within `SETTLED` of the steady one; then the gain is frozen. A block with an invalid sample never runs
+        frozen.
 
     Attributes
     ----------
@@ -98,7 +102,7 @@ class Observer:
         self._sensor_columns = [list(channels).index(name) for name in self.sensors]
         self._drive = DriveReader(self.sources, channels)
         self._u_before: Array | None = None
-        self._full_left = 0
+        self._settled, self._stretch_done = True, 0
 
         model, discrete = driven_model(plant, self.sources, sample_rate_hz, frequency_hz)
         n, m, p = len(model.states), len(self.sources), len(chosen)
@@ -109,7 +113,7 @@ class Observer:
         self.set_model(plant, model, discrete)
         self.filter.x = np.zeros((n, 1))
         self.filter.P = self.steady_covariance.copy()
-        self._full_left = 0
+        self._settled = True
 
     def set_model(self, plant: Plant, model: LinearModel, discrete: DiscreteModel) -> None:
         """Put another model of the same structure in place; state and covariance are carried over.
@@ -137,7 +141,7 @@ class Observer:
         self.steady_covariance = read_only(prior - self._gain @ residual @ self._gain.T)
         self._residual_variance = np.ascontiguousarray(np.diag(residual))
         self._residual_inverse = np.linalg.inv(residual)
-        self._full_left = self._settle_samples
+        self._settled, self._stretch_done = False, 0
 
     def advance(self, block: Block) -> StateEstimate:
         """Filter one block; the filterpy object holds the state at its last sample afterwards.
@@ -157,16 +161,20 @@ class Observer:
         statistics = np.zeros((4, len(self.sensors)))  # count, sum of squares, sum of variances, NIS
         m = len(self.sources)
         B0, B1 = np.ascontiguousarray(kf.B[:, :m]), np.ascontiguousarray(kf.B[:, m:])
-        n_full = min(self._full_left, len(z)) if whole else len(z)
-        if n_full:
-            valid = block.valid[:n_full].take(self._sensor_columns, axis=1)
+        n_full = 0
+        while n_full < len(z) and not (whole and self._settled):
+            # Counted across blocks, so that where a run is cut does not decide when the gain is frozen.
+            stretch = slice(n_full, n_full + self._settle_samples - self._stretch_done)
+            valid = block.valid[stretch].take(self._sensor_columns, axis=1)
             full_covariance_block(
                 kf.F, B0, B1, kf.H, self.feedthrough, kf.Q, self._variance, x, P, self._u_before,
-                u[:n_full], z[:n_full], valid, mean[:n_full], statistics,
+                u[stretch], z[stretch], valid, mean[stretch], statistics,
             )  # fmt: skip
-            self._full_left -= n_full
-        if not whole:
-            self._full_left = self._settle_samples
+            n_full += len(valid)
+            self._stretch_done += len(valid)
+            self._settled = False
+            if self._stretch_done == self._settle_samples:
+                self._settled, self._stretch_done = self._is_steady(P), 0
         if n_full < len(z):
             P = np.array(self.steady_covariance)
             constant_gain_block(
@@ -187,6 +195,10 @@ class Observer:
             nis=float(nis.sum() / count.sum()) if count.sum() else float("nan"),
             sensors=self.sensors,
         )
+
+    def _is_steady(self, P: Array) -> bool:
+        steady = np.diag(self.steady_covariance)
+        return bool(np.all(np.abs(np.diag(P) - steady) <= SETTLED * steady))
 
     def _with_drift(self, plant: Plant, model: LinearModel, rows: list[int]) -> tuple[Array, Array]:
         """System and measurement matrix with the wandering forces as further states."""

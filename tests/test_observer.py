@@ -116,7 +116,7 @@ def relative_covariance(got: Array, expected: Array) -> float:
 def test_full_covariance_is_filterpys_sample_by_sample() -> None:
     observer = rig_observer(settle_samples=10**9)
     observer.filter.P = 30.0 * observer.steady_covariance  # from a state of less knowledge than steady
-    observer._full_left = 10**9
+    observer._settled = False
     u = drives(1500)
     _, z = model_data(observer, u, seed=1)
     oracle = oracle_of(observer)
@@ -182,7 +182,7 @@ def test_force_that_an_accelerometer_feels_at_once_is_fed_through(full_samples: 
     )
     observer = Observer(plant, ("a", "push"), 1000.0)
     assert observer.feedthrough == pytest.approx(np.array([[1.0 / plant.body[0].mass_kg]]))
-    observer._full_left = full_samples  # both kernels
+    observer._settled = full_samples == 0  # both kernels
     u = np.where(np.arange(400) % 40 < 20, 5.0, -5.0)[:, None]
     _, z = model_data(observer, u, seed=4)
     expected = by_filterpy(oracle_of(observer), observer.feedthrough, u, z)
@@ -201,7 +201,7 @@ def test_where_a_run_is_cut_into_blocks_changes_no_bit_of_the_estimate(cuts: lis
 
     def run(where: list[int]) -> bytes:
         observer = rig_observer()
-        observer._full_left = 200
+        observer._settled = False
         pieces = [observer.advance(b).mean for b in blocks_of(rig_values(u, z), DRIVEN, RATE_HZ, where)]
         return np.concatenate(pieces).tobytes() + observer.filter.P.tobytes()
 

@@ -19,7 +19,6 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
 from twin.plant.linear import ComplexArray, natural_frequencies_hz
 
-
 SAME_DAMPING_NS_M = 0.03
 SAME_AMPLITUDE = 5e-3
 """A point is not solved again for changes smaller than these: gains would move by less than a thousandth."""
@@ -177,11 +176,17 @@ class Retuner:
         for row, frequency in enumerate(schedule.frequency_hz):
             if not low - self.goal.reach_hz <= frequency <= high + self.goal.reach_hz:
                 continue
+            question = self._question(plant, damping_std_ns_m, frequency, excitation_amplitude, schedule)
+            known = self._solved.get(row)
+            if known is not None and known.answers(question):
+                points.append((row, known.point))
+                continue
             try:
                 point = self._tune(
                     plant, damping_std_ns_m, frequency, excitation_amplitude, schedule.at(frequency)
                 )
                 points.append((row, point))
+                self._solved[row] = _Solved(question, point)
             except RunError as error:
                 troubles.append(f"{frequency:g} Hz: {error}")
         reason = "; ".join(troubles)
@@ -268,7 +273,8 @@ class Retuner:
                     stroke_m=0.9 * limits.stroke_m,
                 )
             else:
-                margin = min(0.9, margin + 0.05)
+                # Ask for more by what was missing: between the grid's points, or at the other dampings.
+                margin = min(0.9, margin + max(0.01, 1.5 * (self.goal.modulus_margin - found.modulus)))
         raise RunError(trouble)
 
     def _verify(

@@ -5,7 +5,7 @@ from typing import Literal
 
 from twin.control.schedule import Gains
 
-BudgetKind = Literal["joule_mean", "joule_peak", "electrical"]
+BudgetKind = Literal["joule_mean", "joule_peak"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ def rig_block(
     drive: Array,
     disturbance: Array,
     noise: Array,
+    ranges: Array,
     pick: Array,
     gains_from: Array,
     gains_to: Array,
@@ -64,6 +65,8 @@ def rig_block(
         (N,) force on the primary body [N], held over the sample before.
     noise
         (N, p) sensor noise.
+    ranges
+        (p,) largest magnitude each sensor can show; the controller sees what the converter shows.
     pick
         (p,) weights that form the relative acceleration from the sensors.
     gains_from, gains_to
@@ -111,6 +114,7 @@ def rig_block(
                 total += C[i, j] * x[j]
             for j in range(m):
                 total += D[i, j] * u[j]
+            total = min(max(total, -ranges[i]), ranges[i])
             y[k, i] = total
             relative += pick[i] * total
         reference[k] = u[coil_input]
@@ -217,11 +221,11 @@ class SimulatedRig:
         y, reference = np.empty((n, len(self._noise_std))), np.empty(n)
         stroke = rig_block(
             discrete.F, discrete.B0, discrete.B1, discrete.C, discrete.D, self._kick(model),
-            self._x, self._u_before, self._chain, self._delay_line, drive, disturbance, noise, self._pick,
+            self._x, self._u_before, self._chain, self._delay_line, drive, disturbance, noise, self._ranges,
+            self._pick,
             self._packed(f_from), self._packed(f_to), on, self._plant.limits[f"{self._coil.name}_current_a"],
             1.0 / fs, self._coil_input, self._shaker_input, y, reference,
         )  # fmt: skip
-        np.clip(y, -self._ranges, self._ranges, out=y)
         self._guard(stroke, reference)
         self.next_sample = first + n
         return np.column_stack([y, reference]).astype(np.float32), on, acknowledgements

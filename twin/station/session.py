@@ -150,7 +150,6 @@ class Session:
         valid[0] = False  # both kernels of the observer
         for mask in (valid, np.ones_like(valid)):
             twin.observer.advance(Block(0, twin.observer.sample_rate_hz, values, mask, self.channels))
-            twin.observer._full_left = 0
         twin._parallel.advance(Block(0, twin.observer.sample_rate_hz, values, valid, self.channels))
         if twin._learner is not None:
             twin._learner.warm_up()
