@@ -3,29 +3,12 @@
 import math
 from collections.abc import Sequence
 
+from twin.control.filters import paired_low_pass_hz
+from twin.control.laws import scheduled_stiffness
 from twin.control.schedule import Gains, GainSchedule
 from twin.plant.config import Plant
 
-
-def scheduled_stiffness(absorber_mass_kg: float, tuned_hz: float, excitation_hz: float) -> float:
-    """Relative-position gain that moves the absorber's resonance to the excitation.
-
-    gamma = m2 (w² - w2²), thesis eq. 6-5.
-
-    Returns
-    -------
-    float
-        Gain [N/m]; negative below the tuned frequency. The loop is stable for gamma > -k2.
-    """
-    return absorber_mass_kg * ((math.tau * excitation_hz) ** 2 - (math.tau * tuned_hz) ** 2)
-
-
-def paired_low_pass_hz(excitation_hz: float, high_pass_hz: float) -> float:
-    """Low-pass cutoff [Hz] whose lag one high-pass makes good: f_lp f_hp = f², thesis 7.9.3.
-
-    It nulls the phase of the velocity path; the position path has two high-passes and keeps a lead.
-    """
-    return excitation_hz**2 / high_pass_hz
+__all__ = ["paired_low_pass_hz", "scheduled_stiffness", "scheduling_rule"]
 
 
 def scheduling_rule(

@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -32,6 +33,28 @@ JsonOption = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE|-", help="Write the figures as JSON to a file, or - for here."),
 ]
+
+
+class ControllerName(StrEnum):
+    """Control laws of ``atmd analyse``."""
+
+    PASSIVE = "passive"
+    GAIN_SCHEDULING = "gain_scheduling"
+    LQ = "lq"
+
+
+class FeedbackName(StrEnum):
+    """What moves the absorber's resonance."""
+
+    POSITION = "position"
+    ACCELERATION = "acceleration"
+
+
+class MeasurementName(StrEnum):
+    """What the law takes for relative motion."""
+
+    RELATIVE = "relative"
+    ABSOLUTE = "absolute"
 
 
 class Interrupted(BaseException):
@@ -210,6 +233,55 @@ def plants(
         return out
 
     _report({"plants": rows}, table, json_to)
+
+
+@app.command(
+    epilog="Example: atmd analyse --plant engine_vcm --controller gain_scheduling --at 47:53:1 --excitation-n 1000"
+)
+def analyse(
+    plant: Annotated[
+        str, typer.Option(metavar="PRESET|FILE", help="Plant with an absorber.", show_default=False)
+    ],
+    controller: Annotated[
+        ControllerName,
+        typer.Option(help="Passive is the coil open; lq has the weights of thesis Table 6-2."),
+    ] = ControllerName.PASSIVE,
+    feedback: Annotated[
+        FeedbackName, typer.Option(help="Gain scheduling by relative position or acceleration.")
+    ] = FeedbackName.POSITION,
+    measurement: Annotated[
+        MeasurementName, typer.Option(help="Absolute measures the absorber alone.")
+    ] = MeasurementName.RELATIVE,
+    at: Annotated[
+        str, typer.Option(metavar="FROM:TO:STEP|LIST", help="Excitation frequencies in Hz, or 47,50,53.")
+    ] = "45:55:1",
+    excitation_n: Annotated[
+        float, typer.Option(metavar="N", help="Peak of the sine force on the first body, in N.")
+    ] = 1000.0,
+    delay_us: Annotated[
+        float, typer.Option(metavar="US", help="Pure delay from measurement to force, in µs.")
+    ] = 0.0,
+    filters: Annotated[
+        str | None,
+        typer.Option(metavar="LP,HP", help="Cutoffs in Hz of the chain of thesis 7.9; none unless given."),
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Steady state, coil power and stability of a plant under a control law, frequency by frequency.
+
+    Continuous time, the delay exact. Amplitudes are peaks; other actuators than the absorber's coil are unpowered.
+    A coil with a current loop is commanded through it; otherwise the force is ideal and has no current. JSON keys:
+    natural_frequencies_hz, and for each of points: frequency_hz, primary_displacement_m, stroke_m,
+    actuator_force_n, current_a, voltage_v, joule_peak_w (R i_peak²), joule_mean_w (R i_rms²), electrical_mean_w,
+    stable, delay_margin_s (from no delay; null if none below 8 ms destabilises), modulus_margin.
+    """
+    from twin.station.analyse import AnalyseOptions, analysis_table, run_analysis
+
+    _must_be_writable(json_to)
+    options = AnalyseOptions(
+        plant, controller.value, feedback.value, measurement.value, at, excitation_n, delay_us, filters
+    )
+    _report(run_analysis(options), lambda r: analysis_table(r, options), json_to)
 
 
 @app.command(epilog="Example: atmd doctor --json -")
