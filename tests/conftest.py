@@ -1,6 +1,7 @@
 """What all tests share: one thread per matrix product, system packages, measured recordings of other rigs."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,17 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from twin.station.doctor import find_browser, find_software_vulkan  # noqa: E402
 
-DEBIAN_PACKAGES = {"chromium": find_browser, "mesa-vulkan-drivers": find_software_vulkan}
+
+def find_ngspice() -> Path | None:
+    found = shutil.which("ngspice")
+    return Path(found) if found else None
+
+
+DEBIAN_PACKAGES = {
+    "chromium": find_browser,
+    "mesa-vulkan-drivers": find_software_vulkan,
+    "ngspice": find_ngspice,
+}
 
 
 @pytest.fixture(scope="session")
