@@ -143,7 +143,7 @@ def test_feedback_in_the_circuit_is_the_control_law_on_the_plant(plant, data, al
     n = len(plant.body)
     velocities = np.eye(2 * n)[n:]
     expected = frequency_response(A, B, velocities, np.zeros((n, B.shape[1])), HZ)
-    circuit = circuit_of(plant).model_copy(update={"feedback": (law,)})
+    circuit = circuit_of(plant).with_feedback(law)
     np.testing.assert_allclose(
         loop_currents(circuit, HZ), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max(initial=0.0)
     )
@@ -162,7 +162,7 @@ def test_relative_acceleration_feedback_turns_unstable_at_the_reduced_mass():
 
 def test_a_plant_holds_no_controller():
     law = Feedback(name="law", first="primary", second="absorber", beta_ohm=1.0)
-    circuit = circuit_of(load_plant("analogue_2dof")).model_copy(update={"feedback": (law,)})
+    circuit = circuit_of(load_plant("analogue_2dof")).with_feedback(law)
     with pytest.raises(ValueError, match=r"has feedback \(law\)"):
         plant_of(circuit)
 
@@ -226,3 +226,9 @@ def test_a_circuit_that_hangs_in_the_air_is_refused(old, new, message):
     assert old in GOOD
     with pytest.raises(InputError, match=message):
         parse_toml(GOOD.replace(old, new, 1), Circuit, "two.toml")
+
+
+def test_feedback_of_a_loop_that_is_not_there_is_refused():
+    law = Feedback(name="law", first="primary", second="absorbr", beta_ohm=1.0)
+    with pytest.raises(ValueError, match="'absorbr' names no loop"):
+        circuit_of(load_plant("analogue_2dof")).with_feedback(law)

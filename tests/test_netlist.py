@@ -86,7 +86,7 @@ LAWS = {
 def controlled(law: Feedback) -> tuple[Circuit, Array, Array]:
     plant = load_plant("engine")
     A, B = closed_loop(plant, law)
-    return circuit_of(plant).model_copy(update={"feedback": (law,)}), A, B
+    return circuit_of(plant).with_feedback(law), A, B
 
 
 @pytest.mark.parametrize("kind", LAWS)
@@ -105,7 +105,7 @@ def test_controlled_sources_of_the_appendix_are_the_control_law(kind, spice):
 def test_feedback_between_any_two_loops_runs_in_spice(plant, data, alpha, beta, gamma, spice):
     names = data.draw(st.permutations([b.name for b in plant.body]))
     law = Feedback(name="law", first=names[0], second=names[1], alpha_h=alpha, beta_ohm=beta, gamma_1_f=gamma)
-    circuit = circuit_of(plant).model_copy(update={"feedback": (law,)})
+    circuit = circuit_of(plant).with_feedback(law)
     assert_sweep_agrees(spice, circuit, *closed_loop(plant, law), 0)
 
 

@@ -125,6 +125,16 @@ class Circuit(Frozen):
                 raise ValueError(f"feedback '{law.name}': first and second are the same loop")
         return self
 
+    def with_feedback(self, *laws: Feedback) -> "Circuit":
+        """Return a copy with these controlled sources and no others.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If one names no loop, or bears a name that is taken; it is a ValueError.
+        """
+        return Circuit(name=self.name, loop=self.loop, source=self.source, feedback=laws)
+
     def path(self, name: str) -> tuple[Loop, ...]:
         """The loops from that one to the last of its branches; their capacitors' charges add up to its own."""
         by_name = {loop.name: loop for loop in self.loop}
