@@ -3,8 +3,8 @@
 import argparse
 import json
 import os
-import tempfile
 import tomllib
+from dataclasses import asdict
 from pathlib import Path
 
 # Before anything imports NumPy: its library reads these once.
@@ -12,11 +12,12 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 from recordings.results import CONFIG, EXPECTED, FOLDER, RECORDING, replay_results  # noqa: E402
-from twin.rig.recorded import open_recording  # noqa: E402
+from twin.plant.blocks import make_block  # noqa: E402
+from twin.rig.programme import Programme  # noqa: E402
 from twin.rig.recording import Recorder  # noqa: E402
-from twin.station.demo import DemoOptions, run_demo  # noqa: E402
-
-NOTES = ("events", "decisions")
+from twin.rig.simulated import SimulatedRig  # noqa: E402
+from twin.rig.tests_of_chapter_7 import programme  # noqa: E402
+from twin.station.session import Session, SessionSettings  # noqa: E402
 
 
 def main() -> None:
@@ -33,33 +34,38 @@ def main() -> None:
 
 
 def record(folder: Path) -> None:
-    """Run the demonstration as the folder's configuration says and keep what a replay needs of its recording."""
+    """Run the simulated rig as the folder's configuration says, the twin beside it, and record it."""
     config = tomllib.loads((folder / CONFIG).read_text(encoding="utf-8"))
-    with tempfile.TemporaryDirectory() as scratch:
-        whole = Path(scratch) / "whole.rrd"
-        result = run_demo(DemoOptions(**config, recording=whole, speed=0.0), print, lambda _done, _of: None)
-        if "error" in result:
-            raise SystemExit(result["error"])
-        run = open_recording(whole)
-        recorder = Recorder(
-            folder / RECORDING,
-            plant=run.plant,
-            sample_rate_hz=run.sample_rate_hz,
-            channels=run.channels,
-            run_config_json=run.run_config_json,
-            seed=run.seed,
-            overwrite=True,
-        )
-        with recorder:
-            for block in run.blocks():
-                recorder.write_block(block)
-            for command in run.commands():
-                recorder.write_command(command)
-            for sample, answer in run.acknowledgements():
-                recorder.write_acknowledgement(answer, sample)
-            for kind in NOTES:
-                for sample, text in run.notes(kind):
-                    recorder.write_note(kind, sample, text)
+    run = programme(
+        config["test"], seconds=config["seconds"], sweep_hz=tuple(config["sweep_hz"]), seed=config["seed"]
+    )
+    rig = SimulatedRig(run)
+    session = Session(run.plant, rig.channels, run.sample_rate_hz, SessionSettings())
+    recorder = Recorder(
+        folder / RECORDING,
+        plant=run.plant,
+        sample_rate_hz=run.sample_rate_hz,
+        channels=rig.channels,
+        run_config_json=_run_config(run, session),
+        seed=run.seed,
+        overwrite=True,
+    )
+    with recorder:
+        while not rig.finished:
+            first = rig.next_sample
+            values, control_on, _ = rig.next_block()
+            block = make_block(
+                first,
+                run.sample_rate_hz,
+                values,
+                rig.channels,
+                control_on=control_on,
+                config_id=run.plant.fingerprint,
+            )
+            frame = session.advance(block)
+            recorder.write_block(block)
+            for event in frame.events:
+                recorder.write_note("events", event.sample, json.dumps(asdict(event)))
 
 
 def write_expected(folder: Path) -> None:
@@ -67,6 +73,10 @@ def write_expected(folder: Path) -> None:
     results = replay_results(folder / RECORDING)
     del results["digest"]
     (folder / EXPECTED).write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+def _run_config(run: Programme, session: Session) -> str:
+    return json.dumps({"programme": run.model_dump(mode="json"), "session": session.configuration()})
 
 
 if __name__ == "__main__":

@@ -2,15 +2,20 @@
 
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from recordings.results import CONFIG, EXPECTED, RECORDING, recorded_tests, replay_results
+from recordings.results import CONFIG, EXPECTED, FOLDER, RECORDING, recorded_tests, replay_results
+from twin.rig.recorded import open_recording
+from twin.rig.simulated import SimulatedRig
+from twin.rig.tests_of_chapter_7 import TESTS, measured_damping, programme
 
 RELATIVE = 1e-9
-BYTES_PER_FOLDER = 6_000_000
+BYTES_PER_FOLDER, BYTES_IN_ALL = 6_000_000, 24_000_000
 
 
 @pytest.fixture(scope="module", params=recorded_tests(), ids=lambda folder: folder.name)
@@ -50,8 +55,33 @@ def as_plain(value: Any) -> Any:
     return json.loads(json.dumps(value))
 
 
-def test_there_is_a_recorded_test() -> None:
-    assert recorded_tests()
+def test_the_four_tests_of_chapter_7_are_recorded_and_stay_small() -> None:
+    assert {path.name for path in recorded_tests()} >= set(TESTS)
+    assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) < BYTES_IN_ALL
+
+
+def test_data_of_a_simulated_rig_says_so(folder: Path) -> None:
+    if folder.name in TESTS:
+        assert "from the simulated rig of this program, not from a real one" in (
+            folder / "README.md"
+        ).read_text(encoding="utf-8")
+
+
+def test_damping_that_was_learned_is_the_true_one_whatever_the_gains_were(results: dict[str, Any]) -> None:
+    curve, truth = results["damping"], measured_damping()
+    for f, learned in zip(curve["frequency_hz"], curve["damping_ns_m"], strict=True):
+        if 47.0 <= f <= 54.0:
+            assert learned == pytest.approx(truth.at(f), abs=0.25)
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_recorded_samples_are_those_the_programme_gives(test: Any) -> None:
+    config = tomllib.loads((FOLDER / test / CONFIG).read_text(encoding="utf-8"))
+    run = programme(
+        config["test"], seconds=config["seconds"], sweep_hz=config["sweep_hz"], seed=config["seed"]
+    )
+    first = next(open_recording(FOLDER / test / RECORDING).blocks())
+    np.testing.assert_allclose(SimulatedRig(run).next_block()[0], first.values, rtol=1e-4, atol=1e-5)
 
 
 def test_folder_says_what_it_is_and_stays_small(folder: Path) -> None:
