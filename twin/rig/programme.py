@@ -6,16 +6,10 @@ from pydantic import Field, model_validator
 
 from twin.control.schedule import GainSchedule
 from twin.plant.blocks import Channel
-from twin.plant.config import DampingTable, Frozen, NonNegative, Plant, Positive
+from twin.plant.config import GROUND, Actuator, DampingTable, Frozen, NonNegative, Plant, Positive, Sensor
+from twin.rig.excitation import Excitation, Steps, Sweep, Tone, exciter
 
-
-class Sweep(Frozen):
-    """Shaker voltage of constant amplitude whose frequency moves linearly from one end to the other."""
-
-    from_hz: Positive
-    to_hz: Positive
-    duration_s: Positive
-    amplitude_v: Positive
+__all__ = ["Programme", "Steps", "Sweep", "Tone", "rig_channels", "with_accelerometers"]
 
 
 class Programme(Frozen):
@@ -25,6 +19,8 @@ class Programme(Frozen):
     ----------
     plant
         The true plant but for its absorber's damping, which is ``true_damping``.
+    sweep
+        What excites: a `Sweep`, `Steps` or a `Tone`.
     seed
         Seeds sensor noise and ground motion, and nothing else.
     measurement
@@ -37,7 +33,7 @@ class Programme(Frozen):
 
     plant: Plant
     true_damping: DampingTable
-    sweep: Sweep
+    sweep: Excitation
     schedule: GainSchedule
     measurement: Literal["relative", "absolute"] = "relative"
     sample_rate_hz: Positive = 50_000.0
@@ -57,6 +53,7 @@ class Programme(Frozen):
                 raise ValueError(
                     f"limits.{key} [{unit}] is missing: without it the coil may not be driven; add it"
                 )
+        exciter(self.plant, self.sweep)
         fastest = max(self.schedule.low_pass_hz + self.schedule.high_pass_hz)
         if fastest >= 0.5 * self.sample_rate_hz:
             raise ValueError(
@@ -71,6 +68,11 @@ class Programme(Frozen):
         if absorber is None:
             raise ValueError("the plant has no absorber")
         return self.plant.with_damping(absorber.name, self.true_damping)
+
+    @property
+    def exciter(self) -> Actuator:
+        """Actuator that the excitation drives."""
+        return exciter(self.plant, self.sweep)
 
     @property
     def n_blocks(self) -> int:
@@ -88,3 +90,31 @@ def rig_channels(plant: Plant) -> tuple[Channel, ...]:
     coil = plant.voice_coil
     command = () if coil is None else (Channel(coil.name, coil.input_unit),)
     return (*(Channel(s.name, s.unit) for s in plant.sensor), *command)
+
+
+def with_accelerometers(plant: Plant, noise_density: float) -> Plant:
+    """Return the plant with an accelerometer on either end of its coil, where there is none yet.
+
+    What the control law measures is always a sensor of the plant: it has a stated noise, it is recorded, and the
+    twin sees what the controller saw.
+
+    Parameters
+    ----------
+    noise_density
+        One-sided, of the sensors that are added [m/s² per sqrt(Hz)].
+
+    Raises
+    ------
+    ValueError
+        If the plant has no voice coil.
+    """
+    coil = plant.voice_coil
+    if coil is None:
+        raise ValueError(f"plant '{plant.name}' has no voice coil")
+    have = {s.of for s in plant.sensor if s.kind == "acceleration"}
+    added = tuple(
+        Sensor(name=f"{place}_acceleration", kind="acceleration", of=place, noise_density=noise_density)
+        for place, _ in coil.pushes
+        if place != GROUND and place not in have
+    )
+    return plant.model_copy(update={"sensor": (*plant.sensor, *added)})

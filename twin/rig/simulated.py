@@ -6,6 +6,7 @@ limits whatever it is told.
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from twin.control.chain import CHAIN_STATES, chain_step
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
 from twin.plant.compiled import kernel
-from twin.plant.config import Shaker, VoiceCoil
-from twin.plant.discrete import DiscreteModel, discretise
-from twin.plant.linear import Array, LinearModel, linear_model
+from twin.plant.config import VoiceCoil
+from twin.plant.discrete import Hold, discretise
+from twin.plant.linear import Array, LinearModel, linear_model, read_only
+from twin.rig.excitation import Span
 from twin.rig.programme import Programme, rig_channels
 
 POWER_WINDOW_BLOCKS = 10
@@ -44,9 +46,10 @@ def rig_block(
     clamp: float,
     dt: float,
     coil_input: int,
-    shaker_input: int,
+    exciter_input: int,
     y: Array,
     reference: Array,
+    truth: Array,
 ) -> float:
     """Run plant and controller through one block, in place.
 
@@ -60,7 +63,7 @@ def rig_block(
         State carried from block to block: plant (n,), last inputs (m,), filter chain (6,), commands computed
         but not yet at the converter (d,) [A].
     drive
-        (N,) shaker voltage [V].
+        (N,) input of the exciting actuator, in its unit.
     disturbance
         (N,) force on the primary body [N], held over the sample before.
     noise
@@ -80,6 +83,8 @@ def rig_block(
         (N, p) receives the measured sensors.
     reference
         (N,) receives the current reference at the converter [A].
+    truth
+        (N, n) receives the true states; with no rows it is left alone.
 
     Returns
     -------
@@ -95,7 +100,7 @@ def rig_block(
             u[j] = 0.0
         # What the converter holds from this sample on was computed d samples ago.
         u[coil_input] = delay_line[0]
-        u[shaker_input] = drive[k]
+        u[exciter_input] = drive[k]
         for i in range(n):
             total = kick[i] * disturbance[k]
             for j in range(n):
@@ -108,6 +113,9 @@ def rig_block(
             x[i] = fresh[i]
         for j in range(m):
             u_before[j] = u[j]
+        if len(truth) > 0:
+            for i in range(n):
+                truth[k, i] = x[i]
         for i in range(p):
             total = noise[k, i]
             for j in range(n):
@@ -139,25 +147,66 @@ def rig_block(
     return stroke
 
 
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What really happened over N samples without a change of plant or controller. Arrays are read-only.
+
+    Attributes
+    ----------
+    first_sample
+        Of the N; row 0 of the arrays is the sample before it.
+    frequency_hz
+        Where damping given against frequency was read [Hz].
+    model, holds
+        The plant as it was, and how each input went on between samples.
+    states, inputs
+        (N + 1, n) and (N + 1, m), in the model's order and units.
+    """
+
+    first_sample: int
+    frequency_hz: float
+    model: LinearModel
+    holds: tuple[Hold, ...]
+    states: Array
+    inputs: Array
+
+
 class SimulatedRig:
     """A rig in software, advanced block by block.
+
+    Damping that is given against frequency and the controller's gains follow a sweep: within a block the damping is
+    that of its middle and the gains go linearly. Where nothing follows the frequency, and without ground noise, it
+    does not matter for a single bit how the run is cut into blocks.
 
     Parameters
     ----------
     programme
         What to do and what is true.
+    keep_truth
+        Whether ``truth`` is filled, block by block.
+
+    Attributes
+    ----------
+    truth
+        True motion of the latest block: one `Truth`, or one for each step where the excitation's frequency jumps.
     """
 
-    def __init__(self, programme: Programme) -> None:
+    def __init__(self, programme: Programme, *, keep_truth: bool = False) -> None:
         self.programme = programme
+        self.truth: list[Truth] = []
+        self._keep_truth = keep_truth
         plant = programme.true_plant
         coil = plant.voice_coil
-        shaker = next((a for a in plant.actuator if isinstance(a, Shaker)), None)
-        if coil is None or coil.between is None or shaker is None:
-            raise ValueError("the simulated rig needs a voice coil and a shaker")
+        if coil is None or coil.between is None:
+            raise ValueError("the simulated rig needs a voice coil between two bodies")
         self._plant, self._coil = plant, coil
         self._inputs = tuple(a.name for a in plant.actuator)
-        self._coil_input, self._shaker_input = self._inputs.index(coil.name), self._inputs.index(shaker.name)
+        self._coil_input = self._inputs.index(coil.name)
+        self._exciter_input = self._inputs.index(programme.exciter.name)
+        # The converter holds the coil's reference; what amplifies the excitation smooths it.
+        self._holds: tuple[Hold, ...] = tuple(
+            "foh" if j == self._exciter_input else "zoh" for j in range(len(self._inputs))
+        )
         self.channels = rig_channels(plant)
         self._pick = _relative_acceleration(programme, coil)
         self._ranges = np.array([s.range or math.inf for s in plant.sensor])
@@ -184,9 +233,7 @@ class SimulatedRig:
 
     def frequency_at(self, sample: int) -> float:
         """Excitation frequency at a sample [Hz]."""
-        sweep = self.programme.sweep
-        t = sample / self.programme.sample_rate_hz
-        return sweep.from_hz + (sweep.to_hz - sweep.from_hz) * min(t / sweep.duration_s, 1.0)
+        return self.programme.sweep.frequency_at(sample, self.programme.sample_rate_hz)
 
     def accept(self, command: Command) -> None:
         """Take a command in; it acts from the first block that begins at or after its sample."""
@@ -201,7 +248,7 @@ class SimulatedRig:
             (block_samples, n_channels) float32, as a 24-bit converter would give them, in the order of
             ``channels``.
         control_on
-            Whether the controller acted during the block.
+            Whether the controller acted during the block; at its end, where the excitation jumps inside.
         acknowledgements
             Of the commands that took effect at the block's first sample.
         """
@@ -209,26 +256,55 @@ class SimulatedRig:
         n, fs = programme.block_samples, programme.sample_rate_hz
         first = self.next_sample
         acknowledgements = self._apply_due(first)
-        f_from, f_to = self.frequency_at(first), self.frequency_at(first + n)
-        middle = 0.5 * (f_from + f_to)
-        on = self.control_enabled and not self.tripped and self.schedule.acts_at(middle)
-
-        model = self._model(middle)
-        discrete = self._discretise(model)
-        drive = self._shaker_voltage(first, n)
         disturbance = self._rng.normal(0.0, self._force_std, n) if self._force_std > 0.0 else np.zeros(n)
         noise = self._rng.standard_normal((n, len(self._noise_std))) * self._noise_std
+        drive = programme.sweep.samples(first, n, fs)
         y, reference = np.empty((n, len(self._noise_std))), np.empty(n)
-        stroke = rig_block(
-            discrete.F, discrete.B0, discrete.B1, discrete.C, discrete.D, self._kick(model),
-            self._x, self._u_before, self._chain, self._delay_line, drive, disturbance, noise, self._ranges,
-            self._pick,
-            self._packed(f_from), self._packed(f_to), on, self._plant.limits[f"{self._coil.name}_current_a"],
-            1.0 / fs, self._coil_input, self._shaker_input, y, reference,
-        )  # fmt: skip
+        stroke, on = 0.0, False
+        self.truth = []
+        for span in programme.sweep.spans(first, n, fs):
+            rows = slice(span.first - first, span.stop - first)
+            on, reached = self._run(
+                span, drive[rows], disturbance[rows], noise[rows], y[rows], reference[rows]
+            )
+            stroke = max(stroke, reached)
         self._guard(stroke, reference)
         self.next_sample = first + n
         return np.column_stack([y, reference]).astype(np.float32), on, acknowledgements
+
+    def _run(
+        self, span: Span, drive: Array, disturbance: Array, noise: Array, y: Array, reference: Array
+    ) -> tuple[bool, float]:
+        """Go through a span of the excitation; returns whether control acted, and the largest stroke [m]."""
+        middle = 0.5 * (span.from_hz + span.to_hz)
+        on = self.control_enabled and not self.tripped and self.schedule.acts_at(middle)
+        model = self._model(middle)
+        fs = self.programme.sample_rate_hz
+        discrete = discretise(model, fs, self._holds)
+        x_before, u_before = self._x.copy(), self._u_before.copy()
+        states = np.empty((len(drive) if self._keep_truth else 0, len(self._x)))
+        stroke = rig_block(
+            discrete.F, discrete.B0, discrete.B1, discrete.C, discrete.D, self._kick(model),
+            self._x, self._u_before, self._chain, self._delay_line, drive, disturbance, noise, self._ranges,
+            self._pick, self._packed(span.from_hz), self._packed(span.to_hz), on,
+            self._plant.limits[f"{self._coil.name}_current_a"], 1.0 / fs, self._coil_input, self._exciter_input,
+            y, reference, states,
+        )  # fmt: skip
+        if self._keep_truth:
+            inputs = np.zeros((len(drive) + 1, len(self._inputs)))
+            inputs[0] = u_before
+            inputs[1:, self._coil_input], inputs[1:, self._exciter_input] = reference, drive
+            self.truth.append(
+                Truth(
+                    first_sample=span.first,
+                    frequency_hz=middle,
+                    model=model,
+                    holds=self._holds,
+                    states=read_only(np.vstack([x_before, states])),
+                    inputs=read_only(inputs),
+                )
+            )
+        return on, stroke
 
     def _apply_due(self, first: int) -> list[Acknowledgement]:
         due = [c for c in self._pending if c.apply_at_sample <= first]
@@ -278,11 +354,6 @@ class SimulatedRig:
     def _model(self, frequency_hz: float) -> LinearModel:
         return linear_model(self._plant, frequency_hz=frequency_hz)
 
-    def _discretise(self, model: LinearModel) -> DiscreteModel:
-        # The converter holds the coil's reference; the shaker's amplifier smooths its drive.
-        holds = ["foh" if j == self._shaker_input else "zoh" for j in range(len(self._inputs))]
-        return discretise(model, self.programme.sample_rate_hz, holds)  # type: ignore[arg-type]
-
     def _kick(self, model: LinearModel) -> Array:
         """State change per newton held over one sample on the primary body."""
         row = model.states.index(f"v_{self._plant.primary.name}")
@@ -292,12 +363,6 @@ class SimulatedRig:
         # Second order in dt is enough: the force is white, its exact path within 20 µs is immaterial.
         kick[model.states.index(f"x_{self._plant.primary.name}")] = 0.5 * dt * kick[row]
         return kick
-
-    def _shaker_voltage(self, first: int, n: int) -> Array:
-        sweep = self.programme.sweep
-        t = (first + np.arange(n)) / self.programme.sample_rate_hz
-        rate = (sweep.to_hz - sweep.from_hz) / sweep.duration_s
-        return np.asarray(sweep.amplitude_v * np.sin(2.0 * np.pi * (sweep.from_hz + 0.5 * rate * t) * t))
 
 
 def _relative_acceleration(programme: Programme, coil: VoiceCoil) -> Array:
@@ -309,6 +374,9 @@ def _relative_acceleration(programme: Programme, coil: VoiceCoil) -> Array:
     for body, weight in wanted.items():
         found = [i for i, s in enumerate(plant.sensor) if s.kind == "acceleration" and s.of == body]
         if not found:
-            raise ValueError(f"the control law needs an accelerometer on body '{body}'")
+            raise ValueError(
+                f"the control law needs an accelerometer on body '{body}': give plant '{plant.name}' a [[sensor]] "
+                f'with kind = "acceleration" and of = "{body}"'
+            )
         pick[found[0]] = weight
     return pick

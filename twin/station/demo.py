@@ -210,8 +210,7 @@ def describe_run(programme: Programme, options: DemoOptions) -> str:
         [
             "# Thesis Test 3, simulated rig",
             "",
-            f"- excitation: {sweep.amplitude_v:g} V on the shaker, {sweep.from_hz:g} to {sweep.to_hz:g} Hz in "
-            f"{sweep.duration_s:g} s",
+            f"- excitation: {sweep.amplitude:g} {sweep.unit} on the {programme.exciter.name}, {sweep.description}",
             f"- control on between {s.on_from_hz:g} and {s.on_to_hz:g} Hz",
             f"- loop delay {programme.loop_delay_samples} sample + hold at {programme.sample_rate_hz / 1e3:g} kS/s",
             f"- budget {options.budget_w:g} W mean Joule power (R i_rms²)",
