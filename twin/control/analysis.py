@@ -103,8 +103,8 @@ def analyse_point(
     Raises
     ------
     ValueError
-        As `build_loop`; if the plant is undamped and excited exactly at resonance; for a frequency that is not
-        positive or a delay below zero.
+        As `build_loop`; if plant or closed loop is in undamped resonance with the excitation; for a frequency
+        that is not positive or a delay below zero.
     """
     if not (0.0 < frequency_hz < np.inf and 0.0 <= delay_s < np.inf):
         raise ValueError("the frequency must be above 0 Hz and the delay not below 0 s")
@@ -112,7 +112,7 @@ def analyse_point(
     try:
         phasors = loop.steady(frequency_hz, delay_s, excitation)
     except np.linalg.LinAlgError as error:
-        raise ValueError(f"at {frequency_hz:g} Hz the undamped plant is in resonance") from error
+        raise ValueError(f"at {frequency_hz:g} Hz there is a resonance without damping") from error
     motion, stroke, force, current, voltage = (float(size) for size in np.abs(phasors))
     coil = loop.coil
     peak = None if coil is None else coil.resistance_ohm * current**2

@@ -94,12 +94,20 @@ class Loop:
         """Steady-state phasors of `SIGNALS` to a sine excitation, (5,), peaks.
 
         Of an unstable loop this is the periodic solution that it runs away from.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If plant or closed loop has a pole at just this frequency, on the imaginary axis.
         """
         s = 2j * np.pi * frequency_hz
         resolvent = s * np.eye(len(self.A)) - self.A
         by_force, by_excitation = np.linalg.solve(resolvent, np.column_stack([self.b, self.e])).T
         late = np.exp(-s * delay_s)
-        asked = late * (self.c @ by_excitation + self.h) / (1.0 - late * (self.c @ by_force + self.d))
+        rest = 1.0 - late * (self.c @ by_force + self.d)
+        if abs(rest) < 1e-14:
+            raise np.linalg.LinAlgError("the closed loop has a pole at the excitation")
+        asked = late * (self.c @ by_excitation + self.h) / rest
         states = by_force * asked + by_excitation
         return np.asarray((self.rows @ states + self.feed * asked) * excitation)
 

@@ -48,7 +48,8 @@ def unstable_poles_without_delay(loop: Loop) -> int:
     poles = loop.closed_poles
     if not np.isfinite(poles).all():
         return len(poles)
-    return int(np.count_nonzero(poles.real >= -1e-12 * np.abs(poles).max()))
+    size = np.abs(poles)
+    return int(np.count_nonzero(poles.real >= -1e-12 * size - 1e-15 * size.max()))
 
 
 def crossings(loop: Loop) -> tuple[Crossing, ...]:
@@ -56,10 +57,8 @@ def crossings(loop: Loop) -> tuple[Crossing, ...]:
     found = []
     edges = _separators(loop)
     level = _excess(loop, edges)
-    edges, level = (
-        edges[level != 0.0],
-        level[level != 0.0],
-    )  # a separator may hit a crossing to the last digit
+    clear = np.abs(level) > 1e-9  # a separator may hit a crossing to the last digit
+    edges, level = edges[clear], level[clear]
     for k in np.nonzero(level[:-1] * level[1:] < 0.0)[0]:
         w = brentq(lambda x: float(_excess(loop, np.array([x]))[0]), edges[k], edges[k + 1], rtol=1e-14)
         gain = complex(loop.gain(1j * w)[0])
@@ -135,7 +134,8 @@ def modulus_margin(loop: Loop, delay_s: float = 0.0) -> float:
     A grid that is dense around every pole, then a local minimisation in each of its deepest valleys; the limits at
     zero and infinite frequency count.
     """
-    top = 10.0 * float(np.abs(loop.open_poles).max())
+    poles = np.concatenate([loop.open_poles, loop.closed_poles])
+    top = 10.0 * float(np.abs(poles[np.isfinite(poles)]).max())
     w = np.concatenate([_around_poles(loop, top), np.geomspace(1e-3, top, 600)])
     if delay_s > 0.0:
         loud = np.abs(loop.gain(1j * np.geomspace(1.0, top, 300))) > 0.02
