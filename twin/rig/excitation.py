@@ -62,7 +62,8 @@ class _Sine(Frozen):
     @property
     def amplitude(self) -> float:
         """Peak, in ``unit``."""
-        return next(value for key in AMPLITUDES if (value := getattr(self, key)) is not None)
+        values = (self.amplitude_v, self.amplitude_n, self.amplitude_a)
+        return next(value for value in values if value is not None)
 
     @property
     def unit(self) -> Literal["V", "N", "A"]:
