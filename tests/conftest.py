@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # Before anything imports NumPy: its library reads these once.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -18,6 +19,11 @@ def find_ngspice() -> Path | None:
     found = shutil.which("ngspice")
     return Path(found) if found else None
 
+
+# The same examples at every run where a failure must mean a change; new ones on a developer's machine.
+settings.register_profile("repeatable", derandomize=True)
+if os.environ.get("CI"):
+    settings.load_profile("repeatable")
 
 DEBIAN_PACKAGES = {
     "chromium": find_browser,
