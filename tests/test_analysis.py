@@ -5,7 +5,7 @@ import math
 import control
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -30,6 +30,7 @@ FIT = DampingTable(
 )  # thesis 7.9.2
 RIG = load_plant("rig").with_damping("absorber", FIT)
 share = st.floats(0.0, 1.0)
+FEW = [HealthCheck.filter_too_much]  # many random loops are unstable, or far from it
 
 
 def mechanical(name: str) -> Plant:
@@ -275,7 +276,7 @@ def test_any_closed_loop_moves_as_newton_kirchhoff_and_the_law_say(data):
         )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=60, suppress_health_check=FEW)
 @given(plants(), st.floats(5.0, 100.0))
 def test_mean_electrical_power_is_heat_and_work(plant, hz):
     found = analyse(plant, "gain_scheduling", [hz], excitation_n=10.0)[0]
@@ -304,7 +305,7 @@ def pade_poles(loop: Loop, delay_s: float, order: int = 10) -> np.ndarray:
     return control.feedback(control.series(late, plant), control.ss([], [], [], 1.0), sign=1).poles()
 
 
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=80, suppress_health_check=FEW)
 @given(st.data())
 def test_unstable_poles_are_counted_alike_along_the_delay_around_the_origin_and_by_pade(data):
     plant = data.draw(plants())
@@ -328,7 +329,7 @@ def test_unstable_poles_are_counted_alike_along_the_delay_around_the_origin_and_
         assert np.count_nonzero(near.real > 0.0) == count
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=60, suppress_health_check=FEW)
 @given(st.data())
 def test_delay_margin_puts_a_pole_pair_on_the_axis(data):
     plant = data.draw(plants())
@@ -372,18 +373,19 @@ def test_simulated_delay_grows_or_decays_at_the_rate_of_the_exact_poles(delay_us
     assert rate == pytest.approx(exact, abs=0.02)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=40, suppress_health_check=FEW)
 @given(st.data())
 def test_modulus_margin_is_below_every_point_of_a_dense_grid_and_reached(data):
     plant = data.draw(plants())
     hz = 10.0 + 90.0 * data.draw(share)
     delay_s = data.draw(st.sampled_from([0.0, 1e-4]))
     loop = build_loop(plant, data.draw(laws(plant, hz)))
+    assume(unstable_poles(loop, delay_s) == 0)
     w = np.unique(
         np.concatenate(
             [
-                np.geomspace(0.1, 1e5, 20_000),
-                *(np.linspace(0.98, 1.02, 2001) * abs(p) for p in loop.open_poles),
+                np.geomspace(1e-3, 1e7, 30_000),
+                *(np.linspace(0.98, 1.02, 1001) * abs(p) for p in (*loop.open_poles, *loop.closed_poles)),
             ]
         )
     )
@@ -402,9 +404,9 @@ def test_modulus_margin_is_below_every_point_of_a_dense_grid_and_reached(data):
     # with a direct path and a delay an endless row of valleys tends to this limit
     limit = abs(1.0 - loop.d) if delay_s == 0.0 else 1.0 - abs(loop.d)
     brute = min(brute, abs(limit))
-    loose = 1e-9 if loop.d == 0.0 or delay_s == 0.0 else 1e-3
+    loose = 1e-6 if loop.d == 0.0 or delay_s == 0.0 else 1e-3
     assert found <= brute * (1.0 + loose) + 1e-12
-    assert found >= brute - 1e-4
+    assert found >= brute - 1e-3
 
 
 def test_strong_acceleration_feedback_through_an_ideal_force_stands_no_delay_at_all():
