@@ -284,6 +284,27 @@ def analyse(
     _report(run_analysis(options), lambda r: analysis_table(r, options), json_to)
 
 
+@app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")
+def validate(
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write a web page with the thesis's plots redrawn.")
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Compute every figure that the thesis prints and say which come out, which do not, and why.
+
+    JSON keys: rows, each with id, source, unit, thesis, computed, relative_error (absolute), verdict (reproduced,
+    differs, not reproducible) and note with the tolerance; counts by verdict. Ends with 0 once all are computed,
+    whatever the verdicts.
+    """
+    from twin.station.validate import run_validation, validation_table
+
+    _must_be_writable(json_to)
+    with _bar("validate") as progress:
+        result = run_validation(report, _say, progress)
+    _report(result, validation_table, json_to)
+
+
 @app.command(epilog="Example: atmd doctor --json -")
 def doctor(json_to: JsonOption = None) -> None:
     """Say what is installed, what is missing, and what to do about it. Ends with 1 if something needed is missing."""

@@ -9,7 +9,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from twin.control.continuous import build_loop
 from twin.plant.absorber import den_hartog, fixed_points, normalised_amplitude, transmissibility
 from twin.plant.analogue import circuit_of, loop_currents
-from twin.plant.linear import natural_frequencies_hz
+from twin.plant.linear import Array, natural_frequencies_hz
 from twin.plant.shaker import SweepLimits
 from twin.station.validation.models import absorber_of, mechanical, point, preset, tuned_hz
 from twin.station.validation.rows import EXACT, PLOT, Figure, Tolerance, digits
@@ -23,12 +23,12 @@ SCAN = "Shown in a plot only, which the scan lacks; computed here."
 def _flattest() -> tuple[float, float]:
     """Frequency and damping ratio of the lowest peak of eq. 4-6, found by search."""
     g = np.linspace(0.7, 1.3, 4001)
-    found = minimize(
-        lambda x: float(normalised_amplitude(g, x[0], MU, abs(x[1])).max()),
-        [0.97, 0.1],
-        method="Nelder-Mead",
-        options={"xatol": 1e-7, "fatol": 1e-9},
-    )
+
+    def peak(x: Array) -> float:
+        return float(normalised_amplitude(g, x[0], MU, abs(x[1])).max())
+
+    options = {"xatol": 1e-7, "fatol": 1e-9}
+    found = minimize(peak, np.array([0.97, 0.1]), method="Nelder-Mead", options=options)  # type: ignore[call-overload]
     return float(found.x[0]), float(abs(found.x[1]))
 
 
