@@ -342,7 +342,7 @@ def test_delay_margin_puts_a_pole_pair_on_the_axis(data):
     w = at[0].angular_frequency
     assert complex(loop.gain(1j * w)[0]) * np.exp(-1j * w * margin) == pytest.approx(-1.0, abs=1e-6)
     assert unstable_poles_by_winding(loop, 0.99 * margin) == 0
-    assert unstable_poles_by_winding(loop, 1.01 * margin) == 2
+    assert unstable_poles_by_winding(loop, 1.01 * margin) == unstable_poles(loop, 1.01 * margin) >= 2
 
 
 @pytest.mark.parametrize(("delay_us", "grows"), [(50.0, False), (65.0, True)])
