@@ -209,7 +209,16 @@ def plain_loop(run_: Programme, n: int) -> tuple[Array, Array]:
         a = through(0, low[:2], low[2], shown[0] - shown[1])
         v = through(1, high[:2], high[3], a)
         s = through(2, high[:2], high[3], v)
-        asked = (g.alpha_kg * a + g.beta_ns_m * v + g.gamma_n_m * s) / coil.force_constant_n_a
+        # Gains are those of the frequency at the block's ends, joined by a straight line.
+        block, at = divmod(k, run_.block_samples)
+        asked = 0.0
+        table = (run_.schedule.alpha_kg, run_.schedule.beta_ns_m, run_.schedule.gamma_n_m)
+        for column, motion in zip(table, (a, v, s), strict=True):
+            begin, end = (
+                np.interp(f0 + (f1 - f0) * j * run_.block_samples * dt / duration, (40.0, 60.0), column)
+                for j in (block, block + 1)
+            )
+            asked += (begin + (end - begin) * at / run_.block_samples) * motion / coil.force_constant_n_a
         waiting.append(min(max(asked, -limit), limit))
         states[k], references[k] = x, held
     return states, references
@@ -222,8 +231,10 @@ def test_controlled_run_equals_a_plain_sample_by_sample_loop(rig: Plant, delay: 
         s.model_copy(update={"range": 20.0}) if s.name == "absorber_acceleration" else s for s in rig.sensor
     )
     plant = rig.model_copy(update={"sensor": sensors, "limits": rig.limits | {"vcm_current_a": 0.15}})
-    schedule = flat(Gains(0.02, -7.0, -4000.0, 900.0, 2.5))
-    sweep = Sweep(from_hz=47.0, to_hz=52.0, duration_s=0.08, amplitude_v=4.0)
+    schedule = flat(Gains(0.02, -7.0, -4000.0, 900.0, 2.5)).model_copy(
+        update={"alpha_kg": (0.0, 0.04), "beta_ns_m": (-3.0, -11.0), "gamma_n_m": (-8000.0, 500.0)}
+    )
+    sweep = Sweep(from_hz=42.0, to_hz=58.0, duration_s=0.08, amplitude_v=4.0)
     run_ = programme(plant, sweep, schedule, block_samples=500, loop_delay_samples=delay)
     simulated = SimulatedRig(run_, keep_truth=True)
     states, inputs = run(simulated)
@@ -309,28 +320,34 @@ def test_every_analysed_loop_settles_to_its_analysis(name: str, controller: str)
     np.testing.assert_allclose(got[2:][known[2:]], expected[2:][known[2:]], **rest)
 
 
-def test_loop_response_follows_an_adaptive_integrator_from_any_start() -> None:
-    plant = load_plant("engine_vcm")
-    loop = build_loop(plant, Law(0.3, -2.0, -9e4), filters=Cutoffs(500.0, 2.0))
+@pytest.mark.parametrize("filters", [Cutoffs(500.0, 2.0), None], ids=["filters", "ideal"])
+@pytest.mark.parametrize("name", ["engine", "engine_vcm"])
+def test_loop_response_follows_an_adaptive_integrator_from_any_start(
+    name: str, filters: Cutoffs | None
+) -> None:
+    # Acceleration measured directly answers to the force at once: through the ideal actuator to its own force too.
+    loop = build_loop(load_plant(name), Law(0.3, -2.0, -9e4), filters=filters)
+    assert (loop.h != 0.0) == (filters is None)
+    assert (loop.d != 0.0) == (filters is None and name == "engine")
     rng = np.random.default_rng(2)
-    force, rate = rng.normal(size=60), 10_000.0
-    # Displacements, velocities, current and filter states of the sizes they have in a run
-    start = rng.normal(size=len(loop.A)) * np.array(
-        [1e-4, 1e-3, 0.03, 0.3, 1.0, 1e-4, 0.1, 1e-3, 0.3, 1e-4, 1e-3]
-    )
+    force, rate = 1000.0 * rng.normal(size=60), 10_000.0
+    start = 1e-4 * rng.normal(size=len(loop.A))
+
+    def asked(w: Array, pushed: float) -> float:
+        return float((loop.c @ w + loop.h * pushed) / (1.0 - loop.d))
+
     got = loop_response(loop, force, rate, start)
-    x, expected = start, [loop.rows @ start + loop.feed * (loop.c @ start)]
+    x, expected = start, [loop.rows @ start + loop.feed * asked(start, force[0])]
     for k in range(59):
 
         def slope(s: float, w: Array, k: int = k) -> Array:
             pushed = force[k] + (force[k + 1] - force[k]) * s * rate
-            return np.asarray(loop.A @ w + loop.b * (loop.c @ w) + loop.e * pushed)
+            return np.asarray(loop.A @ w + loop.b * asked(w, pushed) + loop.e * pushed)
 
-        x = solve_ivp(slope, (0.0, 1.0 / rate), x, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
-        expected.append(loop.rows @ x + loop.feed * (loop.c @ x))
-    np.testing.assert_allclose(
-        got / np.abs(expected).max(axis=0), expected / np.abs(expected).max(axis=0), atol=1e-9
-    )
+        x = solve_ivp(slope, (0.0, 1.0 / rate), x, method="DOP853", rtol=1e-12, atol=1e-15).y[:, -1]
+        expected.append(loop.rows @ x + loop.feed * asked(x, force[k + 1]))
+    size = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(got / size, expected / size, atol=1e-9)
     assert got.shape == (60, len(SIGNALS))
 
 
@@ -384,6 +401,24 @@ def test_after_each_step_of_the_grid_the_loop_settles_where_that_frequency_has_i
         expected = sampled_steady_state(plant, schedule.at(hz), hz, 1, steps.amplitude)
         assert abs(got[0] - expected[0]) < motion * abs(expected[0])
         assert abs(got[column] - expected[column]) < current_a
+
+
+def test_stroke_passed_before_a_jump_trips_the_guard_though_it_is_small_again_after(rig: Plant) -> None:
+    steps = Steps(
+        steps=tuple(Step(frequency_hz=f, duration_s=s) for f, s in ((50.0, 0.5), (400.0, 0.3), (400.0, 0.2))),
+        amplitude_v=4.0,
+    )
+    simulated = SimulatedRig(
+        programme(rig, steps, scheduling_rule(rig, BAND_HZ), block_samples=50_000), keep_truth=True
+    )
+    simulated.next_block()
+    strokes = [np.abs(t.states[:, 0] - t.states[:, 1]).max() for t in simulated.truth]
+    assert len(strokes) == 3
+    assert strokes[2] < 0.2 * strokes[0]
+    tight = rig.model_copy(update={"limits": rig.limits | {"stroke_m": 0.5 * strokes[0]}})
+    tripped = SimulatedRig(programme(tight, steps, scheduling_rule(rig, BAND_HZ), block_samples=50_000))
+    tripped.next_block()
+    assert tripped.tripped.startswith("stroke ")
 
 
 # --- how a run is cut does not matter -------------------------------------------------------------------------
