@@ -51,7 +51,7 @@ def _rig(axes: list[Axes]) -> None:
         axes[2].plot(f, 3.0 * 11.1 * np.abs(current), color=colour, label=label)
     dress(axes[0], "frequency [Hz]", "table displacement [m]", "table, shaker at 3 V")
     dress(axes[1], "frequency [Hz]", "|absorber / table|", "transmissibility")
-    dress(axes[2], "frequency [Hz]", "shaker force [N]", "shaker force: none at the resonances")
+    dress(axes[2], "frequency [Hz]", "shaker force [N]", "shaker force: least at the resonances")
 
 
 def _rig_requirements(axes: list[Axes]) -> None:

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 Value = float | bool
 Verdict = Literal["reproduced", "differs", "not reproducible"]
 
@@ -68,7 +70,7 @@ class Row:
 
 def judge(figure: Figure) -> Row:
     """Compute a figure and compare it with what is printed."""
-    computed = None if figure.compute is None else figure.compute()
+    computed = None if figure.compute is None else _plain(figure.compute())
     thesis = figure.thesis
     error: float | None = None
     verdict: Verdict = "not reproducible"
@@ -83,6 +85,11 @@ def judge(figure: Figure) -> Row:
     return Row(
         figure.id, figure.source, figure.unit, thesis, computed, error, verdict, _note(figure, verdict)
     )
+
+
+def _plain(value: Value) -> Value:
+    """The value as Python's own number or truth, whatever library it came from."""
+    return bool(value) if isinstance(value, bool | np.bool_) else float(value)
 
 
 def _note(figure: Figure, verdict: Verdict) -> str:
