@@ -11,10 +11,10 @@ from rich.table import Table
 
 from twin.plant.errors import InputError
 from twin.station.validation.catalogue import all_rows, counts
-from twin.station.validation.report import number, percent, write_report
+from twin.station.validation.report import number, write_report
 from twin.station.validation.rows import Row
 
-_COLOUR = {"reproduced": "green", "differs": "red", "not reproducible": "dim"}
+_MARK = {"reproduced": ("✓", "green"), "differs": ("✗", "red"), "not reproducible": ("·", "dim")}
 
 
 def run_validation(
@@ -49,26 +49,28 @@ def run_validation(
 
 
 def validation_table(result: dict[str, Any]) -> Table:
-    """Table for people; the notes are in JSON and report."""
+    """Table for people, no wider than 80 columns; sources and notes are in JSON and report."""
     found = result["counts"]
-    title = ", ".join(f"{found[name]} {name}" for name in _COLOUR) + f" of {found['rows']}"
+    legend = ", ".join(f"{found[name]} [{colour}]{mark}[/] {name}" for name, (mark, colour) in _MARK.items())
     table = Table(
-        title=f"The thesis, recomputed: {title}",
+        title=f"The thesis, recomputed: {legend}",
+        caption="Source, tolerance and reason of every row: --report DIR or --json FILE",
         title_justify="left",
+        caption_justify="left",
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
-    for head, side in (
-        ("figure", "left"), ("source", "left"), ("thesis", "right"), ("computed", "right"), ("unit", "left"),
-        ("error", "right"), ("verdict", "left"),
-    ):  # fmt: skip
-        table.add_column(head, justify=side, overflow="fold")  # type: ignore[arg-type]
+    table.add_column("", no_wrap=True)
+    table.add_column("figure", no_wrap=True)
+    table.add_column("thesis", justify="right", no_wrap=True)
+    table.add_column("computed", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
     for entry in result["rows"]:
         row = Row(**entry)
-        verdict = f"[{_COLOUR[row.verdict]}]{row.verdict}[/]"
-        table.add_row(
-            row.id, row.source, number(row.thesis), number(row.computed), row.unit, percent(row), verdict
-        )
+        mark, colour = _MARK[row.verdict]
+        unit = "" if row.unit in ("1", "true/false") else row.unit
+        values = (number(row.thesis, 4), number(row.computed, 4))
+        table.add_row(f"[{colour}]{mark}[/]", row.id, *values, unit)
     return table
 
 

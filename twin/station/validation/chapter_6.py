@@ -199,7 +199,7 @@ FIGURES = (
         "1000 N, position feedback, beta = -c2, ideal force, 45 to 55 Hz.",
     ),
     Figure(
-        "engine.gain_scheduling_acceleration_below_20um", "6.3, Figure 6-6", "true/false", True,
+        "engine.acceleration_below_20um", "6.3, Figure 6-6", "true/false", True,
         _below_limit("gain_scheduling", "acceleration"), None,
     ),
     Figure(
@@ -248,7 +248,7 @@ FIGURES = (
     _margin_row(54.0),
     _margin_row(55.0),
     Figure(
-        "engine.acceleration_taylor_unstable_below_50hz", "6.10.1.2, Figure 6-25", "true/false", True,
+        "engine.taylor_unstable_below_50hz", "6.10.1.2, Figure 6-25", "true/false", True,
         _taylor_unstable_below_50, None,
         "The first-order Taylor form, as the thesis used it.",
     ),

@@ -181,7 +181,7 @@ DRAWINGS = (
         "tracking", "The zero follows the excitation", "Figures 6-5, 6-6, 11-4, 11-6",
         "Response of the case with the gains of five excitations. The notch lies at the excitation and "
         "takes the upper resonance along; with the absorber's damping cancelled it goes all the way down.",
-        _tracking, ("engine.gain_scheduling_below_20um", "engine.gain_scheduling_acceleration_below_20um"), 2,
+        _tracking, ("engine.gain_scheduling_below_20um", "engine.acceleration_below_20um"), 2,
     ),
     Drawing(
         "lq", "LQ control of the engine", "Figures 6-10, 6-11",
@@ -221,7 +221,7 @@ DRAWINGS = (
         "invented_pole", "The pole that 1 - sτ invents", "Figures 6-25 to 6-29",
         "Acceleration feedback at 47 Hz. The first-order form has an unstable pole at about (1 - 1/d)/τ for "
         "every delay; the loop itself is stable.", _invented,
-        ("engine.acceleration_taylor_unstable_below_50hz", "engine.acceleration_stable_below_50hz"),
+        ("engine.taylor_unstable_below_50hz", "engine.acceleration_stable_below_50hz"),
     ),
     Drawing(
         "delay_lq", "LQ control and delay", "Figures 6-32, 6-33",

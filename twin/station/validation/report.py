@@ -98,13 +98,13 @@ def write_report(
     return page
 
 
-def number(value: Value | None) -> str:
-    """A value as people read it: four significant digits, yes or no for a statement."""
+def number(value: Value | None, significant: int = 5) -> str:
+    """A value as people read it: to some significant digits, yes or no for a statement."""
     if value is None:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.5g}"
+    return f"{value:.{significant}g}"
 
 
 def percent(row: Row) -> str:
