@@ -6,11 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from twin.plant.config import VoiceCoil
+from twin.plant.config import Plant, VoiceCoil
 from twin.plant.files import load_plant
 from twin.plant.linear import frequency_response, linear_model
 from twin.plant.semi_active import (
     coil_impedance,
+    compensated,
     equivalent_damping,
     equivalent_stiffness,
     harvested_power,
@@ -187,3 +188,43 @@ def test_a_load_that_is_an_amplifier_is_refused(load_ohm):
 def test_a_plant_without_a_coil_has_nothing_to_load():
     with pytest.raises(ValueError, match="no voice coil"):
         shunted(load_plant("engine"), 1.0)
+
+
+def test_coil_whose_inductive_drop_is_made_good_is_a_coil_without_inductance() -> None:
+    # The limit L -> 0 of the shorted circuit, taken on the circuit itself, is the independent answer.
+    rig = load_plant("rig")
+    short = shunted(rig, 0.0)
+    coil = short.voice_coil
+    assert coil is not None
+    tiny = coil.model_copy(update={"inductance_h": 1e-9})
+    limit = short.model_copy(update={"actuator": (tiny, short.actuator[1])})
+    damped = compensated(rig)
+    f = np.linspace(5.0, 100.0, 96)
+    expected = linear_model(limit).response(f)[:, 0, 1]
+    row = linear_model(damped)
+    np.testing.assert_allclose(row.response(f)[:, 0, 0], expected, rtol=1e-6)
+    assert damped.absorber is not None
+    assert damped.absorber.damping_ns_m == pytest.approx(7.0 + 64.0 / 2.7)
+
+
+def test_notch_moved_by_the_shorted_coil_returns_when_its_drop_is_made_good() -> None:
+    # Thesis 7.5.4: the shift seen with the shorted coil disappears, its damping stays.
+    rig = load_plant("rig")
+    f = np.linspace(45.0, 56.0, 22_001)
+
+    def notch(plant: Plant, column: int, **model: object) -> float:
+        response = linear_model(plant, **model).response(f)[:, :2, column]  # type: ignore[arg-type]
+        # Stroke per table motion peaks where the absorber resonates, whatever the table is attached to.
+        ratio = np.abs((response[:, 1] - response[:, 0]) / response[:, 0])
+        return float(f[np.argmax(ratio)])
+
+    shorted_hz = notch(shunted(rig, 0.0), 1)
+    compensated_hz = notch(compensated(rig), 0)
+    damped_open_hz = notch(rig.with_damping("absorber", 7.0 + 64.0 / 2.7), 1, current_driven=("vcm",))
+    assert compensated_hz == damped_open_hz
+    assert shorted_hz - compensated_hz == pytest.approx(0.67, abs=0.15)
+
+
+def test_coil_that_is_not_across_the_absorbers_spring_is_refused() -> None:
+    with pytest.raises(ValueError, match="no voice coil"):
+        compensated(load_plant("rig_no_vcm"))

@@ -9,7 +9,7 @@ does not add mass to it (against thesis 7.5.3). An infinite load is the open coi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin.plant.config import Plant, VoiceCoil
+from twin.plant.config import DampingTable, Plant, VoiceCoil
 from twin.plant.linear import Array, ComplexArray
 
 TAU = 2.0 * np.pi
@@ -124,3 +124,38 @@ def shunted(plant: Plant, load_ohm: float) -> Plant:
         update={"resistance_ohm": coil.resistance_ohm + load_ohm, "current_loop_kp_v_a": None}
     )
     return plant.model_copy(update={"actuator": tuple(loaded if a is coil else a for a in plant.actuator)})
+
+
+def compensated(plant: Plant, load_ohm: float = 0.0) -> Plant:
+    """The plant with its coil on a load and the inductive drop made good by ``v = L di/dt``.
+
+    What is left of the circuit is ``R i = -k (x2' - x1')``: a plain damper k²/(R + r) between the coil's two
+    bodies, without the spring k²/L that shifts the absorber's resonance (thesis 7.5.4, validation test 3).
+
+    Returns
+    -------
+    Plant
+        A copy without the coil, its damping added to the absorber's at every frequency.
+
+    Raises
+    ------
+    ValueError
+        If the plant has no voice coil across the absorber's own spring, or the load cannot be.
+    """
+    loaded = shunted(plant, load_ohm).voice_coil
+    absorber = plant.absorber
+    if loaded is None or loaded.between is None or absorber is None:
+        raise ValueError(f"plant '{plant.name}' has no voice coil between two bodies")
+    if loaded.between != (absorber.attached_to, absorber.name):
+        raise ValueError(f"actuator '{loaded.name}' does not act across the spring of '{absorber.name}'")
+    extra = loaded.force_constant_n_a**2 / loaded.resistance_ohm
+    damping = absorber.damping_ns_m
+    if isinstance(damping, DampingTable):
+        damping = damping.model_copy(update={"ns_m": tuple(c + extra for c in damping.ns_m)})
+    else:
+        damping = damping + extra
+    others = tuple(a for a in plant.actuator if a.name != loaded.name)
+    sensors = tuple(s for s in plant.sensor if s.of != loaded.name)
+    limits = {k: v for k, v in plant.limits.items() if not k.startswith(f"{loaded.name}_")}
+    damped = plant.with_damping(absorber.name, damping)
+    return damped.model_copy(update={"actuator": others, "sensor": sensors, "limits": limits})
