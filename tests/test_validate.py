@@ -209,7 +209,7 @@ def test_fit_refuses_what_it_cannot_use(added, hz, message):
 def test_page_holds_every_row_and_every_drawing_and_nothing_from_elsewhere(result, folder):
     page = (folder / "index.html").read_text(encoding="utf-8")
     for row in result["rows"]:
-        assert f"<code>{row['id']}</code>" in page
+        assert f'<tr id="{row["id"]}">' in page
     for drawing in DRAWINGS:
         assert f'src="{drawing.name}.png"' in page
         picture = (folder / f"{drawing.name}.png").read_bytes()

@@ -61,7 +61,7 @@ h3 { margin: 0; font-size: 1.05rem; } .badges { margin-top: .5rem; display: flex
 th, td { text-align: left; vertical-align: top; padding: .4rem .6rem; border-bottom: 1px solid var(--line); }
 th { background: #fff; border-bottom: 2px solid #b0bec5; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-code { font: .82rem ui-monospace, "SF Mono", Consolas, monospace; } td code { word-break: break-word; }
+code { font: .82rem ui-monospace, "SF Mono", Consolas, monospace; } td:first-child { min-width: 11.5rem; }
 nav a { margin-right: 1.1rem; } a { color: #1565c0; }
 """
 
@@ -168,8 +168,9 @@ def _figure(drawing: Drawing, picture: str, verdicts: dict[str, Row]) -> str:
 
 
 def _row(row: Row) -> str:
+    name = row.id.replace(".", ".<wbr>").replace("_", "_<wbr>")
     return (
-        f"<tr><td><code>{html.escape(row.id)}</code></td><td>{html.escape(row.source)}</td>"
+        f'<tr id="{row.id}"><td><code>{name}</code></td><td>{html.escape(row.source)}</td>'
         f'<td class="n">{number(row.thesis)}</td><td class="n">{number(row.computed)}</td>'
         f'<td>{html.escape(row.unit)}</td><td class="n">{percent(row)}</td>'
         f'<td><span class="badge {_MARK[row.verdict]}">{row.verdict}</span></td>'
