@@ -263,7 +263,13 @@ def test_any_closed_loop_moves_as_newton_kirchhoff_and_the_law_say(data):
     assert found.stroke_m == pytest.approx(abs(stroke), rel=1e-6, abs=floor)
     assert found.actuator_force_n == pytest.approx(abs(force), rel=1e-6, abs=1e-9)
     coil = absorber_coil(plant)
-    if coil is None or coil.current_loop_kp_v_a is None:
+    if coil is not None and coil.current_loop_kp_v_a is None:
+        # An ideal current source: Kirchhoff's voltage for the current that gives the force.
+        s = 2j * math.pi * hz
+        current = force / coil.force_constant_n_a
+        volts = coil.resistance_ohm * current + s * coil.inductance_h * current
+        volts += coil.force_constant_n_a * s * -stroke
+    if coil is None:
         assert (found.current_a, found.voltage_v, found.joule_peak_w, found.electrical_mean_w) == (None,) * 4
     else:
         assert found.current_a == pytest.approx(abs(current), rel=1e-6, abs=1e-9)
@@ -326,7 +332,7 @@ def test_unstable_poles_are_counted_alike_along_the_delay_around_the_origin_and_
     near = near[np.abs(near) * max(delay_s, 1e-9) < 6.0]  # where the rational form still is the delay
     right = poles[(poles.real > 0.0) & (np.abs(poles) * max(delay_s, 1e-9) < 6.0)]
     if len(right) == count:
-        assert np.count_nonzero(near.real > 0.0) == count
+        assert np.count_nonzero(near.real > 0.5 * scale) == count  # none that rounding put on the axis
 
 
 @settings(deadline=None, max_examples=60, suppress_health_check=FEW)

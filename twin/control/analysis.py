@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.control.continuous import build_loop
 from twin.control.filters import Cutoffs
-from twin.control.laws import Feedback, Law, Measurement, scheduled_law
+from twin.control.laws import Feedback, Law, Measurement, absorber_coil, scheduled_law
 from twin.control.lq import force_model, lq_gain, table_6_2_weights
 from twin.control.margins import delay_margin_s, modulus_margin, unstable_poles
 from twin.plant.config import Plant
@@ -25,7 +25,8 @@ class OperatingPoint:
     primary_displacement_m, stroke_m, actuator_force_n
         Motion of the first body, of the absorber against what its force pushes off, and that force.
     current_a, voltage_v
-        Of the coil; None without a coil that has a current loop. An open coil shows its back-EMF as voltage.
+        Of the coil; None without one. A coil without a current loop is fed by an ideal current source. An open
+        coil shows its back-EMF as voltage.
     joule_peak_w, joule_mean_w, electrical_mean_w
         R i_peak² (the thesis's "power"), R i_rms², and the mean of v i; None as the current is.
     stable
@@ -113,8 +114,13 @@ def analyse_point(
         phasors = loop.steady(frequency_hz, delay_s, excitation)
     except np.linalg.LinAlgError as error:
         raise ValueError(f"at {frequency_hz:g} Hz there is a resonance without damping") from error
-    motion, stroke, force, current, voltage = (float(size) for size in np.abs(phasors))
     coil = loop.coil
+    if coil is None and (coil := absorber_coil(plant)) is not None:
+        # Without a current loop the coil is fed by an ideal current source: the force is exact, the voltage follows.
+        w, k = 2j * np.pi * frequency_hz, coil.force_constant_n_a
+        phasors[3] = phasors[2] / k
+        phasors[4] = (coil.resistance_ohm + w * coil.inductance_h) * phasors[3] - w * k * phasors[1]
+    motion, stroke, force, current, voltage = (float(size) for size in np.abs(phasors))
     peak = None if coil is None else coil.resistance_ohm * current**2
     return OperatingPoint(
         frequency_hz=frequency_hz,
