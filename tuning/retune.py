@@ -19,7 +19,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
 from twin.plant.linear import ComplexArray, natural_frequencies_hz
 
-SAME_DAMPING_NS_M = 0.03
+SAME_DAMPING_NS_M = 0.06
 SAME_AMPLITUDE = 5e-3
 """A point is not solved again for changes smaller than these: gains would move by less than a thousandth."""
 
