@@ -2,11 +2,13 @@
 
 import math
 
+import control
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 from twin.control.continuous import build_loop
+from twin.control.delay import growth_rate_1_s
 from twin.control.laws import Law, scheduled_law
 from twin.control.lq import (
     bryson_weights,
@@ -14,9 +16,11 @@ from twin.control.lq import (
     kalman_observer,
     lq_gain,
     lqg_controller,
+    lqg_loop,
     placed_observer,
     table_6_2_weights,
 )
+from twin.control.margins import delay_margin_s
 from twin.control.noise import (
     TABLE_6_3_VARIANCES,
     law_as_state_gain,
@@ -144,6 +148,29 @@ def test_observer_has_the_controllers_poles_four_times_as_far_out_and_keeps_them
     both = np.concatenate([wanted, wanted / 4.0])
     apart = np.abs(np.linalg.eigvals(whole)[:, None] - both).min(axis=1)
     assert np.all(apart < 1e-5 * np.abs(both).max())
+
+
+def test_exact_delay_margin_of_lqg_puts_a_pole_pair_on_the_axis():
+    K = lq_gain(MODEL, bryson_weights([2e-5, 1.0, 6e-3, 100.0]), bryson_weights(100.0))
+    C = np.eye(2, 4)
+    L = placed_observer(MODEL, C, K)
+    loop = lqg_loop(ENGINE, C, K, L)
+    # Separation: the closed loop has the regulator's poles and the observer's.
+    apart = np.concatenate([
+        np.linalg.eigvals(MODEL.A - np.outer(MODEL.b, K)), np.linalg.eigvals(MODEL.A - L @ C)
+    ])  # fmt: skip
+    nearest = np.abs(loop.closed_poles[:, None] - apart).min(axis=1)
+    assert np.all(nearest < 1e-5 * np.abs(apart).max())
+    # The loop gain is controller times plant, by python-control; the controller's own sign is that of f = -K x.
+    s = 2j * math.pi * np.array([1.0, 20.0, 50.0, 55.0, 120.0])
+    controller = lqg_controller(MODEL, C, K, L)
+    plant = control.ss(MODEL.A, MODEL.b[:, None], C, np.zeros((2, 1)))
+    expected = -np.array([(controller(point) @ plant(point)).item() for point in s])
+    np.testing.assert_allclose(loop.gain(s), expected, rtol=1e-6)
+    margin = delay_margin_s(loop)
+    assert margin is not None
+    assert margin > 0.0
+    assert growth_rate_1_s(loop, 0.98 * margin) < 0.0 < growth_rate_1_s(loop, 1.02 * margin)
 
 
 @pytest.mark.parametrize("largest", [[0.0], [-1.0], [np.nan]])

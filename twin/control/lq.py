@@ -12,6 +12,7 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twin.control.continuous import Loop, build_loop
 from twin.control.laws import actuated_pair
 from twin.plant.config import ForceActuator, Plant
 from twin.plant.linear import Array, ComplexArray, linear_model, read_only
@@ -138,6 +139,51 @@ def lqg_controller(model: ForceModel, C: ArrayLike, K: Array, L: Array) -> contr
     measured = np.atleast_2d(np.asarray(C, dtype=np.float64))
     A = model.A - np.outer(model.b, K) - L @ measured
     return control.ss(A, L, -K[None, :], np.zeros((1, len(measured))))
+
+
+def lqg_loop(plant: Plant, C: ArrayLike, K: Array, L: Array, frequency_hz: float | None = None) -> Loop:
+    """LQG on a plant as a loop opened at the commanded force, for its exact margins and steady state.
+
+    The observer knows what it commands, not when a delay lets it act: that is what the delay margin is about.
+
+    Parameters
+    ----------
+    C
+        (p, 2 n) measured outputs from the states of `force_model`.
+    K, L
+        (2 n,) gain and (2 n, p) observer gain.
+    frequency_hz
+        Where damping given against frequency is read [Hz].
+
+    Raises
+    ------
+    ValueError
+        If the plant has no absorber.
+    """
+    model = force_model(plant, frequency_hz)
+    measured = np.atleast_2d(np.asarray(C, dtype=np.float64))
+    size = len(model.A)
+    plain = build_loop(plant, np.zeros(size), frequency_hz=frequency_hz)
+    correction = np.asarray(L, dtype=np.float64).reshape(size, len(measured)) @ measured
+    A = np.zeros((2 * size, 2 * size))
+    A[:size, :size], A[size:, :size] = model.A, correction
+    A[size:, size:] = model.A - np.outer(model.b, K) - correction
+    zero = np.zeros(size)
+    rows = np.full((5, 2 * size), np.nan)
+    rows[:3] = 0.0
+    rows[:2, :size] = plain.rows[:2, :size]
+    return Loop(
+        A=A,
+        b=np.concatenate([model.b, zero]),
+        c=np.concatenate([zero, -K]),
+        d=0.0,
+        e=np.concatenate([model.e, zero]),
+        h=0.0,
+        rows=rows,
+        feed=np.array([0.0, 0.0, 1.0, np.nan, np.nan]),
+        mechanical_states=size,
+        coil=None,
+    )
 
 
 def _apart(poles: ComplexArray) -> ComplexArray:
