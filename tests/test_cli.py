@@ -6,7 +6,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +111,9 @@ def test_a_second_recording_of_the_same_name_does_not_cost_the_first(tmp_path: P
     assert open_recording(tmp_path / "run.rrd").n_blocks == 20
 
 
-def test_killed_rig_ends_the_twin_with_a_message_and_a_readable_recording(tmp_path: Path) -> None:
+@contextmanager
+def demo_in_mid_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], psutil.Process]]:
+    """A demo in real time, three seconds into its recording, and the process of its rig."""
     command = [
         sys.executable,
         "-m",
@@ -124,11 +127,16 @@ def test_killed_rig_ends_the_twin_with_a_message_and_a_readable_recording(tmp_pa
     ]
     with subprocess.Popen(
         [*command, "--save", "run.rrd", "--json", "-"],
-        cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         rig = wait_for_rig(process.pid)
-        wait_until((tmp_path / "run.rrd").exists, 60.0)
-        time.sleep(3.0)  # of data
+        wait_until((folder / "run.rrd").exists, 60.0)
+        time.sleep(3.0)
+        yield process, rig
+
+
+def test_killed_rig_ends_the_twin_with_a_message_and_a_readable_recording(tmp_path: Path) -> None:
+    with demo_in_mid_run(tmp_path) as (process, rig):
         rig.send_signal(signal.SIGKILL)
         out, err = process.communicate(timeout=90)
     assert process.returncode == 3
@@ -146,23 +154,7 @@ def test_killed_rig_ends_the_twin_with_a_message_and_a_readable_recording(tmp_pa
 
 
 def test_interrupted_demo_leaves_a_readable_recording_and_no_rig_behind(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "twin.station.cli",
-        "demo",
-        "--headless",
-        "--speed",
-        "1",
-        "--seconds",
-        "60",
-    ]
-    with subprocess.Popen(
-        [*command, "--save", "run.rrd"], cwd=tmp_path, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
-    ) as process:
-        rig = wait_for_rig(process.pid)
-        wait_until((tmp_path / "run.rrd").exists, 60.0)
-        time.sleep(3.0)
+    with demo_in_mid_run(tmp_path) as (process, rig):
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -317,7 +309,7 @@ def test_recording_cut_in_the_middle_is_replayed_as_far_as_it_goes(
     assert "cut short" in " ".join(replayed["remarks"])
 
 
-@pytest.mark.parametrize("command", ["demo", "replay", "plants", "doctor"])
+@pytest.mark.parametrize("command", ["demo", "replay", "plants", "analyse", "validate", "doctor"])
 def test_help_has_an_example(tmp_path: Path, command: str) -> None:
     done = atmd(command, "--help", cwd=tmp_path)
     assert done.returncode == 0
@@ -333,7 +325,9 @@ def test_presets_are_listed_with_their_frequencies(tmp_path: Path) -> None:
     assert plants["rig"]["natural_frequencies_hz"] == pytest.approx([11.09, 54.92], abs=0.01)
 
 
-def test_doctor_answers(tmp_path: Path) -> None:
+def test_doctor_ends_with_what_it_found(tmp_path: Path) -> None:
     done = atmd("doctor", "--json", "-", cwd=tmp_path)
-    assert done.returncode in (0, 1)
-    assert json.loads(done.stdout)
+    found = json.loads(done.stdout)
+    missing = [c for c in found["checks"] if c["required"] and not c["ok"]]
+    assert done.returncode == (1 if missing else 0)
+    assert {"control", "cvxpy", "filterpy", "osqp", "rerun-sdk"} <= {c["name"] for c in found["checks"]}

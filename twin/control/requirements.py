@@ -66,7 +66,7 @@ def load_catalogue(path: Path | None = None) -> CoilCatalogue:
 
 @dataclass(frozen=True, slots=True)
 class Requirements:
-    """Largest figures over a band of excitation frequencies; peaks, SI. None without a coil with a current loop."""
+    """Largest figures over a band of excitation frequencies; peaks, SI. None without a coil."""
 
     primary_displacement_m: float
     stroke_m: float

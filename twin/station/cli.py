@@ -270,7 +270,8 @@ def analyse(
     """Steady state, coil power and stability of a plant under a control law, frequency by frequency.
 
     Continuous time, the delay exact. Amplitudes are peaks; other actuators than the absorber's coil are unpowered.
-    A coil with a current loop is commanded through it; otherwise the force is ideal and has no current. JSON keys:
+    A coil with a current loop is commanded through it, one without is an ideal current source, and without a coil the
+    force is ideal and has no current. JSON keys:
     natural_frequencies_hz, and for each of points: frequency_hz, primary_displacement_m, stroke_m,
     actuator_force_n, current_a, voltage_v, joule_peak_w (R i_peak²), joule_mean_w (R i_rms²), electrical_mean_w,
     stable, delay_margin_s (from no delay; null if none below 8 ms destabilises), modulus_margin.
