@@ -1,20 +1,27 @@
 """The command line: ``atmd``."""
 
-import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from twin.plant.errors import InputError, RunError
+from twin.station.terminal import (
+    JsonOption,
+    must_be_writable,
+    number,
+    people,
+    percent,
+    progress_bar,
+    report,
+    say,
+    with_unit,
+)
 
 EXIT_INPUT, EXIT_RUN, EXIT_INTERRUPTED = 2, 3, 130
 
@@ -26,13 +33,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-people = Console(stderr=True)
-"""Where people read: standard error, so that standard output is the command's result alone."""
-
-JsonOption = Annotated[
-    str | None,
-    typer.Option("--json", metavar="FILE|-", help="Write the figures as JSON to a file, or - for here."),
-]
 
 
 class ControllerName(StrEnum):
@@ -126,20 +126,20 @@ def demo(
     from twin.station.outputs import has_display
 
     _must_be_rrd(save)
-    _must_be_writable(json_to)
+    must_be_writable(json_to)
     recording = save if save is not None else Path("runs") / "demo.rrd"
     window = not headless and not web and has_display()
     options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed)
-    _say(
+    say(
         f"Simulated rig, thesis Test 3: {SWEEP_HZ[0]:g} to {SWEEP_HZ[1]:g} Hz in {seconds:g} s; "
         f"recording to {recording}"
     )
-    with _bar("demo") as progress:
-        result = run_demo(options, _say, progress, _wait_for_browser if web else None)
+    with progress_bar("demo") as progress:
+        result = run_demo(options, say, progress, _wait_for_browser if web else None)
     if not window and not web and result["blocks"]:
         result["picture"] = _draw(recording)
-    _report(result, _demo_table, json_to)
-    _say(f"recording: {recording}   open it with: {_viewer_command(recording)}")
+    report(result, _demo_table, json_to)
+    say(f"recording: {recording}   open it with: {_viewer_command(recording)}")
     if "error" in result:
         raise RunError(result["error"] + f" What was recorded until then is whole: {recording}")
 
@@ -188,15 +188,15 @@ def replay(
     from twin.station.replay import ReplayOptions, run_replay
 
     _must_be_rrd(save)
-    _must_be_writable(json_to)
+    must_be_writable(json_to)
     if view and not has_display():
         raise InputError(
             "--view: this machine has no display; use --web, or --save FILE.rrd and open that elsewhere"
         )
     options = ReplayOptions(plant, _channel_options(channel or []), sample_rate, sidecar, save, view, web)
-    with _bar("replay") as progress:
-        result = run_replay(file, options, _say, progress, _wait_for_browser if web else None)
-    _report(result, _replay_table, json_to)
+    with progress_bar("replay") as progress:
+        result = run_replay(file, options, say, progress, _wait_for_browser if web else None)
+    report(result, _replay_table, json_to)
 
 
 @app.command(epilog="Example: atmd plants rig   ·   atmd plants my_rig.toml --json -")
@@ -232,7 +232,7 @@ def plants(
             out.add_row(p.name, *parts, ", ".join(f"{f:.2f}" for f in hz))
         return out
 
-    _report({"plants": rows}, table, json_to)
+    report({"plants": rows}, table, json_to)
 
 
 @app.command(
@@ -278,17 +278,18 @@ def analyse(
     """
     from twin.station.analyse import AnalyseOptions, analysis_table, run_analysis
 
-    _must_be_writable(json_to)
+    must_be_writable(json_to)
     options = AnalyseOptions(
         plant, controller.value, feedback.value, measurement.value, at, excitation_n, delay_us, filters
     )
-    _report(run_analysis(options), lambda r: analysis_table(r, options), json_to)
+    report(run_analysis(options), lambda r: analysis_table(r, options), json_to)
 
 
 @app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")
 def validate(
-    report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write a web page with the thesis's plots redrawn.")
+    report_to: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="DIR", help="Write a web page with the thesis's plots redrawn."),
     ] = None,
     json_to: JsonOption = None,
 ) -> None:
@@ -300,10 +301,10 @@ def validate(
     """
     from twin.station.validate import run_validation, validation_table
 
-    _must_be_writable(json_to)
-    with _bar("validate") as progress:
-        result = run_validation(report, _say, progress)
-    _report(result, validation_table, json_to)
+    must_be_writable(json_to)
+    with progress_bar("validate") as progress:
+        result = run_validation(report_to, say, progress)
+    report(result, validation_table, json_to)
 
 
 @app.command(epilog="Example: atmd doctor --json -")
@@ -312,7 +313,7 @@ def doctor(json_to: JsonOption = None) -> None:
     from twin.station.doctor import as_json, as_table, exit_code, run_checks
 
     checks = run_checks()
-    _report(as_json(checks), lambda _: as_table(checks), json_to)
+    report(as_json(checks), lambda _: as_table(checks), json_to)
     raise typer.Exit(exit_code(checks))
 
 
@@ -334,18 +335,6 @@ def _top(
     """Digital twin of an active vibration rig: it runs beside the rig, learns its damping and retunes it."""
 
 
-def _say(line: str) -> None:
-    people.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, console=people, transient=True, disable=not people.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
 def _wait_for_browser() -> None:
     """Keep serving until the person at the terminal has seen enough; without one, end with the run."""
     if sys.stdin.isatty() and people.is_terminal:
@@ -359,23 +348,9 @@ def _draw(recording: Path) -> str | None:
 
     drawn = save_picture(recording, recording.with_suffix(".png"), time_s=None)
     if drawn.note:
-        _say(drawn.note)
-    _say(f"picture: {drawn.path} ({drawn.how})")
+        say(drawn.note)
+    say(f"picture: {drawn.path} ({drawn.how})")
     return str(drawn.path)
-
-
-def _report(result: dict[str, Any], table: Callable[[dict[str, Any]], Table], json_to: str | None) -> None:
-    (Console() if json_to is None else people).print(table(result))
-    if json_to is None:
-        return
-    text = json.dumps(result, indent=2, allow_nan=False)
-    if json_to == "-":
-        sys.stdout.write(text + "\n")
-        return
-    try:
-        Path(json_to).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json {json_to}: cannot be written ({error.strerror})") from error
 
 
 def _demo_table(r: dict[str, Any]) -> Table:
@@ -383,19 +358,19 @@ def _demo_table(r: dict[str, Any]) -> Table:
         "figure", "value", "", title="Demo: thesis Test 3, retuned while it runs", title_justify="left"
     )
     table.add_row(
-        "mean attenuation, 45 to 55 Hz", _percent(r["attenuation_mean"]), "against the same rig, passive"
+        "mean attenuation, 45 to 55 Hz", percent(r["attenuation_mean"]), "against the same rig, passive"
     )
-    table.add_row("worst attenuation", _percent(r["attenuation_worst"]), "0.5 s after control came on")
-    table.add_row("peak current", _with_unit(r["current_peak_a"], "A"), "limit 2 A")
+    table.add_row("worst attenuation", percent(r["attenuation_worst"]), "0.5 s after control came on")
+    table.add_row("peak current", with_unit(r["current_peak_a"], "A"), "limit 2 A")
     budget = f"budget {r['budget_w']:g} W ({r['budget_kind'].replace('_', ' ')})"
-    table.add_row("mean Joule power R i_rms²", _with_unit(r["joule_mean_w"], "W"), budget)
-    table.add_row("peak Joule power R i_peak²", _with_unit(r["joule_peak_w"], "W"), "")
-    table.add_row("mean electrical power v i", _with_unit(r["electrical_mean_w"], "W"), "")
+    table.add_row("mean Joule power R i_rms²", with_unit(r["joule_mean_w"], "W"), budget)
+    table.add_row("peak Joule power R i_peak²", with_unit(r["joule_peak_w"], "W"), "")
+    table.add_row("mean electrical power v i", with_unit(r["electrical_mean_w"], "W"), "")
     table.add_row(
-        "damping c2(f), learned - true", _with_unit(r["damping_rmse_ns_m"], "Ns/m"), "rms, 45 to 55 Hz"
+        "damping c2(f), learned - true", with_unit(r["damping_rmse_ns_m"], "Ns/m"), "rms, 45 to 55 Hz"
     )
     table.add_row("blocks, dropped", f"{r['blocks']}, {r['dropped']}", f"{r['commands']} commands obeyed")
-    table.add_row("real-time factor", _number(r["realtime_factor"]), "time of data / time in the loop")
+    table.add_row("real-time factor", number(r["realtime_factor"]), "time of data / time in the loop")
     return table
 
 
@@ -408,29 +383,15 @@ def _replay_table(r: dict[str, Any]) -> Table:
         remark = f"without the known input {without:.4f}" if without is not None else ""
         table.add_row(f"NRMSE {s['sensor']}", f"{s['nrmse']:.4f}", f"{remark} ({s['rows']} rows)")
     if r["attenuation_mean"] is not None:
-        table.add_row(
-            "mean attenuation", _percent(r["attenuation_mean"]), "against the model without control"
-        )
+        table.add_row("mean attenuation", percent(r["attenuation_mean"]), "against the model without control")
     if r["joule_mean_w"] is not None:
-        table.add_row("mean Joule power", _with_unit(r["joule_mean_w"], "W"), "largest of any block")
+        table.add_row("mean Joule power", with_unit(r["joule_mean_w"], "W"), "largest of any block")
     if r["decisions_repeated"] is not None:
         table.add_row(
             "decisions repeated", "yes" if r["decisions_repeated"] else "no", f"{r['commands']} commands"
         )
-    table.add_row("real-time factor", _number(r["realtime_factor"]), "time of data / time in the loop")
+    table.add_row("real-time factor", number(r["realtime_factor"]), "time of data / time in the loop")
     return table
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100.0 * share:.1f} %"
-
-
-def _with_unit(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g} {unit}"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
 
 
 def _channel_options(options: list[str]) -> dict[str, str]:
@@ -446,17 +407,6 @@ def _channel_options(options: list[str]) -> dict[str, str]:
 def _must_be_rrd(path: Path | None) -> None:
     if path is not None and path.suffix.lower() != ".rrd":
         raise InputError(f"--save {path}: a recording's name ends in .rrd")
-
-
-def _must_be_writable(json_to: str | None) -> None:
-    """Say now, not after the run, that its figures could not be written."""
-    if json_to is None or json_to == "-":
-        return
-    path = Path(json_to)
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        raise InputError(
-            f"--json {json_to}: cannot be written; give a file in a folder that exists, or - for standard output"
-        )
 
 
 def _viewer_command(recording: Path) -> str:

@@ -1,0 +1,78 @@
+"""What every command of ``atmd`` says to people and to programs: messages, progress, tables, JSON."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from twin.plant.errors import InputError
+
+people = Console(stderr=True)
+"""Where people read: standard error, so that standard output is the command's result alone."""
+
+JsonOption = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE|-", help="Write the figures as JSON to a file, or - for here."),
+]
+
+
+def say(line: str) -> None:
+    """Tell the person at the terminal, on standard error."""
+    people.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show progress on a terminal while the block runs; yields ``update(done, total)``."""
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=people, transient=True, disable=not people.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def report(result: dict[str, Any], table: Callable[[dict[str, Any]], Table], json_to: str | None) -> None:
+    """Print a result as a table, and as JSON where it was asked for."""
+    (Console() if json_to is None else people).print(table(result))
+    if json_to is None:
+        return
+    text = json.dumps(result, indent=2, allow_nan=False)
+    if json_to == "-":
+        sys.stdout.write(text + "\n")
+        return
+    try:
+        Path(json_to).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--json {json_to}: cannot be written ({error.strerror})") from error
+
+
+def must_be_writable(json_to: str | None) -> None:
+    """Say now, not after the run, that its figures could not be written."""
+    if json_to is None or json_to == "-":
+        return
+    path = Path(json_to)
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise InputError(
+            f"--json {json_to}: cannot be written; give a file in a folder that exists, or - for standard output"
+        )
+
+
+def percent(share: float | None) -> str:
+    """Share in percent, or a dash."""
+    return "-" if share is None else f"{100.0 * share:.1f} %"
+
+
+def with_unit(value: float | None, unit: str) -> str:
+    """Three figures with their unit, or a dash."""
+    return "-" if value is None else f"{value:.3g} {unit}"
+
+
+def number(value: float | None) -> str:
+    """Three figures, or a dash."""
+    return "-" if value is None else f"{value:.3g}"
