@@ -26,7 +26,7 @@ from twin.plant.discrete import discretise
 from twin.plant.files import load_plant
 from twin.plant.linear import linear_model
 from twin.rig.excitation import Step, Steps, Sweep, Tone, exciter
-from twin.rig.gateway import EmbeddedRig
+from twin.rig.embedded import EmbeddedRig
 from twin.rig.programme import Programme, with_accelerometers
 from twin.rig.simulated import SimulatedRig
 

@@ -23,7 +23,8 @@ from twin.plant.config import DampingTable
 from twin.plant.errors import RunError
 from twin.plant.files import load_plant
 from twin.rig import gateway as gateway_module
-from twin.rig.gateway import EmbeddedRig, RigGateway
+from twin.rig.embedded import EmbeddedRig
+from twin.rig.gateway import RigGateway
 from twin.rig.programme import Programme, Sweep, rig_channels
 from twin.rig.simulated import SimulatedRig
 from twin.rig.wire import (
@@ -178,7 +179,7 @@ def test_rig_outlives_nobody_its_process_ends_when_its_starter_is_killed() -> No
     order = programme(duration_s=600.0).model_dump_json()
     header = (
         "import sys, types\n"
-        "from twin.rig.gateway import EmbeddedRig\n"
+        "from twin.rig.embedded import EmbeddedRig\n"
         "from twin.rig.programme import Programme\n"
         "m = types.ModuleType('tests_programme')\n"
         "m.rig = EmbeddedRig(Programme.model_validate_json(sys.stdin.readline()), speed=1.0)\n"
@@ -217,8 +218,14 @@ def test_rig_in_real_time_without_heartbeats_falls_back_to_no_control() -> None:
                 # worked through what has not been sent: that must not keep the watch from acting later.
                 rig.gateway.heartbeat(10**12)
                 rig.gateway.send(Command(command_id=1, apply_at_sample=0, control_enabled=True))
-    first_off = on.index(False)  # by the rig's own clock: half a second and a block of patience
-    assert first_off == 7
+        answers = {a.command_id: a for a in rig.gateway.acknowledgements() if not a.accepted}
+    assert "repeated or out of order" in answers[1].reason
+    assert "stale: it was due 1." in answers[2].reason
+    assert "made for model 0123" in answers[3].reason
+    first_off = on.index(
+        False
+    )  # safe half a second after the rig last heard of its station, by its own clock
+    assert first_off == 5
     assert notices[first_off] == "station lost: control off"
     assert notices[0] == ""
     back = on.index(True, first_off)
@@ -299,6 +306,15 @@ def test_only_the_station_whose_key_the_rig_knows_gets_through(monkeypatch: pyte
 # --- a rig that misbehaves, played by the test -------------------------------------------------------------
 
 
+HELLO: dict[str, object] = {
+    "version": 2,
+    "run_id": "a",
+    "sample_rate_hz": 50_000.0,
+    "block_samples": 100,
+    "channels": [{"name": c.name, "unit": c.unit} for c in rig_channels(PLANT)],
+}
+
+
 @dataclass
 class FalseRig:
     """A publisher that sends what the test wants, behind the same wire."""
@@ -309,11 +325,10 @@ class FalseRig:
 
     def send(self, first: int, values: NDArray[np.float64], **changes: object) -> None:
         header: dict[str, object] = {
-            "sequence": 0,
+            "run_id": "a",
+            "sequence": first // 100,
             "first_sample": first,
             "n_samples": len(values),
-            "sample_rate_hz": 50_000.0,
-            "channels": [{"name": c.name, "unit": c.unit} for c in rig_channels(PLANT)],
             "config_id": "abc",
             "control_on": True,
             "commands_applied": [],
@@ -338,7 +353,7 @@ def false_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[FalseRig]:
     link = station(ports, station_keys, rig_keys.public)
 
     def hello() -> bool:
-        samples.send_multipart([TOPIC_HELLO, encode({"version": 1})])
+        samples.send_multipart([TOPIC_HELLO, encode(HELLO)])
         return True
 
     link.connect(hello)
@@ -388,24 +403,66 @@ def test_rig_that_falls_silent_is_given_up_with_the_last_sample_heard(false_rig:
     "changes",
     [
         {"n_samples": 7},
-        {"channels": [{"name": "a"}]},
-        {"channels": 3},
+        {"n_samples": 10**9},
         {"first_sample": "now"},
+        {"first_sample": -5},
         {"commands_applied": None},
     ],
 )
-def test_block_that_cannot_be_read_ends_the_run_with_words(
+def test_block_that_cannot_be_read_is_left_out_counted_and_told(
     false_rig: FalseRig, changes: dict[str, object]
 ) -> None:
-    false_rig.send(0, rows(10), **changes)
-    with pytest.raises(RunError, match="cannot be read"):
-        next(false_rig.gateway.blocks())
-
-
-def test_header_that_is_no_json_ends_the_run_with_words(false_rig: FalseRig) -> None:
+    false_rig.send(0, rows(100))
+    false_rig.send(100, rows(100), **changes)
     false_rig.samples.send_multipart([TOPIC_SAMPLES, b"\xff", b""])
-    with pytest.raises(RunError, match="not JSON"):
-        next(false_rig.gateway.blocks())
+    false_rig.samples.send_multipart([TOPIC_SAMPLES])
+    false_rig.samples.send_multipart([TOPIC_HELLO, b"{"])
+    false_rig.send(200, rows(100))
+    false_rig.samples.send_multipart([TOPIC_END, encode({"next_sample": 300})])
+    blocks = list(false_rig.gateway.blocks())
+    assert [b.first_sample for b in blocks] == [0, 100, 200]
+    assert [bool(b.valid.any()) for b in blocks] == [True, False, True]
+    assert false_rig.gateway.malformed == 4
+    assert false_rig.gateway.dropped == 1
+    assert len(false_rig.gateway.events()) == 4
+
+
+def test_rig_that_starts_again_goes_on_in_the_same_count_of_samples(false_rig: FalseRig) -> None:
+    gateway = false_rig.gateway
+    false_rig.send(0, rows(100))
+    false_rig.samples.send_multipart([TOPIC_HELLO, encode(HELLO | {"run_id": "b", "waits_for_start": True})])
+    false_rig.send(100, rows(100), run_id="a")  # a straggler of the run that is over
+    false_rig.send(0, rows(100), run_id="b", sequence=0)
+    false_rig.samples.send_multipart([TOPIC_END, encode({"next_sample": 100})])
+    blocks = list(gateway.blocks())
+    starts = [b.first_sample for b in blocks]
+    assert starts == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[0].valid.all()
+    assert blocks[-1].valid.all()
+    assert not any(b.valid.any() for b in blocks[1:-1])
+    assert gateway.restarts == 1
+    assert any("started again" in event for event in gateway.events())
+    # What the rig calls sample 50 is another number here, and the other way round.
+    offset = blocks[-1].first_sample
+    gateway.send(Command(command_id=1, apply_at_sample=offset + 50))
+    messages = [decode(false_rig.commands.recv_multipart()[1]) for _ in range(2)]
+    assert messages[0] == {"type": "start"}
+    assert messages[1]["command"]["apply_at_sample"] == 50
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"sample_rate_hz": 10_000.0}, {"channels": [{"name": "a", "unit": "V"}]}, {"config_id": "xyz"}],
+)
+def test_rig_that_comes_back_as_another_ends_the_run_with_words(
+    false_rig: FalseRig, changes: dict[str, object]
+) -> None:
+    false_rig.send(0, rows(100))
+    false_rig.samples.send_multipart([TOPIC_HELLO, encode(HELLO | {"run_id": "b"} | changes)])
+    blocks = false_rig.gateway.blocks()
+    assert next(blocks).first_sample == 0
+    with pytest.raises(RunError, match=f"came back with another {next(iter(changes))}"):
+        next(blocks)
 
 
 def test_secret_key_is_not_shown() -> None:

@@ -101,12 +101,15 @@ class Command(Frozen):
         The controller's new schedule; None leaves it as it is.
     control_enabled
         False switches the controller off whatever the schedule says; None leaves it as it is.
+    config_id
+        Fingerprint of the plant the command was made for; a rig set up for another refuses it. Empty: any.
     """
 
     command_id: int = Field(ge=1)
     apply_at_sample: int = Field(ge=0)
     schedule: GainSchedule | None = None
     control_enabled: bool | None = None
+    config_id: str = Field(default="", max_length=200)
 
 
 class Acknowledgement(Frozen):

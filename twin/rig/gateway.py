@@ -1,14 +1,10 @@
 """The station's end of the wire: blocks in, commands out, and what to do when the rig falls silent."""
 
 import contextlib
-import json
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from types import TracebackType
-from typing import Any, Self
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import zmq
@@ -18,17 +14,31 @@ from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import Plant
 from twin.plant.errors import RunError
-from twin.rig.programme import Programme, rig_channels
+from twin.rig.arrivals import ArrivalCounts, Arrivals
+from twin.rig.drift import ClockDrift
+from twin.rig.messages import VERSION, Hello, SamplesHeader
 from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_client
 
 CONNECT_TIMEOUT_S = 60.0
 SILENCE_TIMEOUT_S = 5.0
+POLL_MS = 100
+
+
+@dataclass(slots=True)
+class _Run:
+    """One run of the rig: its own count of samples, and where that count lies in the station's."""
+
+    hello: Hello
+    channels: tuple[Channel, ...]
+    offset: int = 0
+    arrivals: Arrivals = field(default_factory=Arrivals)
 
 
 class RigGateway:
-    """One connection to a rig; iterate it for blocks.
+    """One connection to a rig; iterate `blocks`.
 
-    Lost blocks come out as blocks without a valid sample and are counted in ``dropped``.
+    Lost blocks come out as blocks without a valid sample. A rig that was started again goes on in the same count of
+    samples: the pause between is masked, by this machine's clock.
 
     Parameters
     ----------
@@ -39,12 +49,24 @@ class RigGateway:
     keys
         The station's own.
     rig_public
-        The rig's public key.
+        The rig's public key: nobody else can answer.
+
+    Attributes
+    ----------
+    notice
+        What the rig says of itself, with the latest block; empty if nothing.
+    drift
+        `ClockDrift` of rig against station.
+    malformed
+        Messages that could not be read and were left out.
+    restarts
+        How often the rig began anew.
     """
 
     def __init__(
         self, plant: Plant, samples_address: str, commands_address: str, keys: KeyPair, rig_public: bytes
     ) -> None:
+        self._plant = plant
         self._ranges_by_name = {s.name: s.range for s in plant.sensor if s.range is not None}
         self._context = zmq.Context()
         self._samples = self._context.socket(zmq.SUB)
@@ -55,67 +77,150 @@ class RigGateway:
             socket.connect(address)
         for topic in (TOPIC_HELLO, TOPIC_SAMPLES, TOPIC_END):
             self._samples.subscribe(topic)
-        self.dropped = 0
         self.notice = ""
+        self.drift = ClockDrift()
+        self.malformed = self.restarts = 0
+        self._run: _Run | None = None
+        self._past = ArrivalCounts()
+        self._last_arrival_s = 0.0
+        self._events: list[str] = []
         self._acknowledgements: list[Acknowledgement] = []
-        self._expected_sample: int | None = None
 
-    def connect(self, is_alive: Any = lambda: True) -> None:
-        """Wait until both sockets are through, then let the rig begin.
+    @property
+    def hello(self) -> Hello:
+        """What the rig said of itself; RunError before `connect`."""
+        if self._run is None:
+            raise RunError("the rig is not connected")
+        return self._run.hello
+
+    @property
+    def counts(self) -> ArrivalCounts:
+        """What the wire did to the blocks, all runs of the rig together."""
+        now = self._run.arrivals.counts if self._run is not None else ArrivalCounts()
+        return ArrivalCounts(
+            *(getattr(self._past, name) + getattr(now, name) for name in ArrivalCounts.__slots__)
+        )
+
+    @property
+    def dropped(self) -> int:
+        """Blocks whose samples are lost."""
+        return self.counts.lost
+
+    def connect(self, is_alive: Callable[[], bool] = lambda: True, timeout_s: float | None = None) -> Hello:
+        """Wait until both sockets are through and the rig has said what it is, then let it begin.
+
+        Parameters
+        ----------
+        is_alive
+            Whether there is still somebody to wait for.
+        timeout_s
+            Give up after so many seconds; `CONNECT_TIMEOUT_S` unless given.
 
         Raises
         ------
         RunError
-            If the rig does not answer in time: wrong address, wrong key, or no rig.
+            If the rig does not answer in time: wrong address, wrong key, or no rig; or if it cannot be understood.
         """
-        end = time.monotonic() + CONNECT_TIMEOUT_S
-        while not self._samples.poll(100):
-            if not is_alive():
-                raise RunError("the rig ended before it began; its own message stands above")
-            if time.monotonic() > end:
-                raise RunError(f"no rig answered within {CONNECT_TIMEOUT_S:.0f} s: check address and keys")
+        timeout_s = CONNECT_TIMEOUT_S if timeout_s is None else timeout_s
+        end = time.monotonic() + timeout_s
+        while self._run is None:
+            while not self._samples.poll(POLL_MS):
+                if not is_alive():
+                    raise RunError("the rig ended before it began; its own message stands above")
+                if time.monotonic() > end:
+                    raise RunError(f"no rig answered within {timeout_s:.0f} s: check address and keys")
+            topic, *frames = self._samples.recv_multipart()
+            if topic == TOPIC_HELLO:
+                self._greet(frames)
+            elif time.monotonic() > end:
+                raise RunError(
+                    f"the rig sends samples but no hello of protocol version {VERSION} within {timeout_s:.0f} s; "
+                    "see docs/protocol.md"
+                )
         self._send({"type": "start"})
+        return self._run.hello
 
-    def blocks(self, is_alive: Any = lambda: True) -> Iterator[Block]:
+    def blocks(
+        self,
+        is_alive: Callable[[], bool] = lambda: True,
+        *,
+        patience_s: float | None = None,
+        on_silence: Callable[[float], None] | None = None,
+    ) -> Iterator[Block]:
         """Blocks in order until the rig says it has finished.
 
+        Parameters
+        ----------
+        is_alive
+            Whether there is still somebody to wait for.
+        patience_s
+            Silence after which the rig is given up; `SILENCE_TIMEOUT_S` unless given, infinity waits for ever.
+        on_silence
+            Called every tenth of a second without a message, with the seconds it has lasted.
+
         Raises
         ------
         RunError
-            If the rig falls silent, dies, or sends what cannot be read.
+            If the rig falls silent or dies, or comes back as another rig.
         """
+        patience_s = SILENCE_TIMEOUT_S if patience_s is None else patience_s
         while True:
-            waited, alive = 0.0, True
-            while not self._samples.poll(100):
-                waited += 0.1
+            silent_since, alive = time.monotonic(), True
+            while not self._samples.poll(POLL_MS):
+                waited = time.monotonic() - silent_since
                 if not alive:
                     raise RunError(f"The rig's process ended in mid-run{self._last_heard()}.")
                 alive = is_alive()  # one more look at the socket after the process has gone
-                if waited > SILENCE_TIMEOUT_S:
+                if waited > patience_s:
                     raise RunError(f"The rig has been silent for {waited:.0f} s{self._last_heard()}.")
+                if on_silence is not None:
+                    on_silence(waited)
             topic, *frames = self._samples.recv_multipart()
             if topic == TOPIC_END:
+                if self._run is not None:
+                    yield from self._run.arrivals.flush()
                 return
-            if topic == TOPIC_SAMPLES and len(frames) == 2:
-                yield from self._with_gaps(self._read(frames[0], frames[1]))
+            if topic == TOPIC_HELLO:
+                self._greet(frames)
+            elif topic == TOPIC_SAMPLES:
+                yield from self._take_samples(frames)
 
     def heartbeat(self, next_sample: int) -> None:
         """Tell the rig how far the station has worked through its data."""
-        self._send({"type": "heartbeat", "next_sample": next_sample})
+        self._send({"type": "heartbeat", "next_sample": max(0, next_sample - self._offset)})
 
     def send(self, command: Command) -> None:
         """Send a command; its acknowledgement arrives through `acknowledgements`."""
-        self._send({"type": "command", "command": command.model_dump(mode="json")})
+        due = max(0, command.apply_at_sample - self._offset)
+        message = command.model_copy(update={"apply_at_sample": due}).model_dump(mode="json")
+        self._send({"type": "command", "command": message})
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """What the rig has answered since the last call."""
         while self._commands.poll(0):
-            message = decode(self._commands.recv())
-            if message.pop("type", "") == "ack":
-                with contextlib.suppress(ValidationError):
-                    self._acknowledgements.append(Acknowledgement.model_validate(message))
+            frames = self._commands.recv_multipart()
+            try:
+                message = decode(frames[0]) if len(frames) == 1 else {}
+                kind = message.pop("type", "")
+                if kind == "ack":
+                    answer = Acknowledgement.model_validate(message)
+                    if answer.applied_at_sample is not None:
+                        at = answer.applied_at_sample + self._offset
+                        answer = answer.model_copy(update={"applied_at_sample": at})
+                    self._acknowledgements.append(answer)
+                elif kind == "refused":
+                    self._events.append(f"the rig refused a message: {str(message.get('reason', ''))[:200]}")
+                else:
+                    self.malformed += 1
+            except (RunError, ValidationError):
+                self.malformed += 1
         answers, self._acknowledgements = tuple(self._acknowledgements), []
         return answers
+
+    def events(self) -> tuple[str, ...]:
+        """What has happened to the connection since the last call, in words."""
+        events, self._events = tuple(self._events), []
+        return events
 
     def close(self) -> None:
         """Take leave of the rig and close both sockets."""
@@ -123,147 +228,90 @@ class RigGateway:
             self._send({"type": "stop"})
         self._context.destroy(linger=200)
 
+    @property
+    def _offset(self) -> int:
+        return self._run.offset if self._run is not None else 0
+
     def _send(self, message: dict[str, Any]) -> None:
-        self._commands.send(encode(message), flags=zmq.NOBLOCK)
+        # A rig that is away and a full queue: heartbeats and commands for then would come too late anyway.
+        with contextlib.suppress(zmq.Again):
+            self._commands.send(encode(message), flags=zmq.NOBLOCK)
 
     def _last_heard(self) -> str:
-        return "" if self._expected_sample is None else f" (last sample {self._expected_sample - 1})"
+        following = self._run.arrivals.next_sample if self._run is not None else None
+        return "" if following is None else f" (last sample {following - 1})"
 
-    def _read(self, header_frame: bytes, payload: bytes) -> Block:
-        header = decode(header_frame)
+    def _greet(self, frames: list[bytes]) -> None:
         try:
-            channels = tuple(Channel(c["name"], c["unit"]) for c in header["channels"])
-            values = np.frombuffer(payload, dtype="<f4").reshape(header["n_samples"], len(channels))
-            ranges = np.array([self._ranges_by_name.get(c.name, np.inf) for c in channels])
-            self.notice = str(header.get("notice", ""))
-            return make_block(
-                int(header["first_sample"]), float(header["sample_rate_hz"]), values, channels, ranges,
-                config_id=str(header["config_id"]), control_on=bool(header["control_on"]),
-                commands_applied=tuple(int(i) for i in header["commands_applied"]),
-            )  # fmt: skip
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunError(f"a block of samples cannot be read: {error!r}") from error
-
-    def _with_gaps(self, block: Block) -> Iterator[Block]:
-        """Put blocks without a valid sample in the place of lost ones."""
-        expected = self._expected_sample
-        if expected is not None and block.first_sample > expected:
-            missing = block.first_sample - expected
-            self.dropped += -(-missing // block.n_samples)
-            lost = np.full((missing, len(block.channels)), np.nan)
-            yield make_block(expected, block.sample_rate_hz, lost, block.channels, config_id=block.config_id)
-        self._expected_sample = block.end_sample
-        yield block
-
-
-class EmbeddedRig:
-    """A simulated rig in a process of its own, with fresh keys, and the gateway to it.
-
-    Use as a context manager: leaving it ends the process.
-    """
-
-    def __init__(self, programme: Programme, speed: float) -> None:
-        self.programme = programme
-        self._speed = speed
-        self._process: subprocess.Popen[bytes] | None = None
-        self._gateway: RigGateway | None = None
-
-    def __enter__(self) -> Self:
-        rig_keys, station_keys = KeyPair.fresh(), KeyPair.fresh()
-        environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        process = subprocess.Popen(
-            [sys.executable, "-m", "twin.rig.process"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
-        )  # fmt: skip
-        self._process = process
-        order = {
-            "programme": self.programme.model_dump(mode="json"),
-            "rig_public": rig_keys.public.decode(),
-            "rig_secret": rig_keys.secret.decode(),
-            "station_public": station_keys.public.decode(),
-            "speed": self._speed,
-        }
-        if process.stdin is None:
-            raise RunError("the rig's process has no pipes")
-        with contextlib.suppress(BrokenPipeError):  # `connect` will find that it is gone
-            process.stdin.write(json.dumps(order).encode() + b"\n")
-            process.stdin.flush()
-        self._keys, self._rig_public = station_keys, rig_keys.public
-        return self
-
-    def connect(self) -> None:
-        """Wait for the rig to be ready and let it begin.
-
-        Raises
-        ------
-        RunError
-            If its process did not start.
-        """
-        process = self._process
-        try:
-            line = process.stdout.readline() if process is not None and process.stdout is not None else b""
-            ports = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise RunError("the rig's process did not start; its own message stands above") from error
-        self._gateway = RigGateway(
-            self.programme.plant,
-            f"tcp://127.0.0.1:{ports['samples_port']}",
-            f"tcp://127.0.0.1:{ports['commands_port']}",
-            self._keys,
-            self._rig_public,
-        )
-        self._gateway.connect(self.is_alive)
-
-    @property
-    def gateway(self) -> RigGateway:
-        """The connection; RunError before `connect`."""
-        if self._gateway is None:
-            raise RunError("the rig is not connected")
-        return self._gateway
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """What its blocks will hold."""
-        return rig_channels(self.programme.plant)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._gateway is not None:
-            self._gateway.close()
-        process = self._process
-        if process is None:
+            hello = Hello.model_validate_json(frames[0] if len(frames) == 1 else b"")
+        except ValidationError as error:
+            self._complain(f"a hello cannot be read: {_first(error)}")
             return
-        # Let it take its leave; a closed input tells it that nobody is left; then there is nothing to be said.
-        if not _ended(process):
-            with contextlib.suppress(OSError):
-                if process.stdin is not None:
-                    process.stdin.close()
-            if not _ended(process):
-                process.kill()
-                process.wait()
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
+        run = self._run
+        if run is None:
+            self._run = _Run(hello, hello.block_channels())
+            if hello.config_id and hello.config_id != self._plant.fingerprint:
+                self._events.append(
+                    f"the rig is set up for plant '{hello.plant}' ({hello.config_id}), "
+                    f"this station models '{self._plant.name}' ({self._plant.fingerprint})"
+                )
+        elif hello.run_id != run.hello.run_id:
+            self._begin_anew(run, hello)
 
-    @property
-    def pid(self) -> int:
-        """Process number of the rig."""
-        return self._process.pid if self._process is not None else 0
+    def _begin_anew(self, run: _Run, hello: Hello) -> None:
+        old = run.hello
+        for what in ("sample_rate_hz", "channels", "config_id"):
+            if getattr(hello, what) != getattr(old, what):
+                raise RunError(
+                    f"the rig came back with another {what} ({getattr(old, what)} before, {getattr(hello, what)} now); "
+                    "start again for a new recording"
+                )
+        counts = self.counts
+        away_s = max(0.0, time.monotonic() - self._last_arrival_s)
+        following = run.arrivals.next_sample or 0
+        fresh = _Run(hello, run.channels, offset=following + round(away_s * hello.sample_rate_hz))
+        fresh.arrivals.next_sample = following
+        self._past, self._run = counts, fresh
+        self.restarts += 1
+        self.drift.restart()
+        self._events.append(f"the rig was started again; {away_s:.1f} s without samples are masked")
+        if hello.waits_for_start:
+            self._send({"type": "start"})
 
-    def is_alive(self) -> bool:
-        """Whether the rig's process runs."""
-        return self._process is not None and self._process.poll() is None
+    def _take_samples(self, frames: list[bytes]) -> Iterator[Block]:
+        run = self._run
+        if run is None or len(frames) != 2:
+            self._complain("a message of samples has not three frames")
+            return
+        try:
+            header = SamplesHeader.model_validate_json(frames[0])
+        except ValidationError as error:
+            self._complain(f"the header of a block cannot be read: {_first(error)}")
+            return
+        if header.run_id != run.hello.run_id:
+            return  # of a run whose hello has not come yet: its place will be masked
+        wanted = 4 * header.n_samples * len(run.channels)
+        if len(frames[1]) != wanted:
+            self._complain(f"block {header.sequence} has {len(frames[1])} bytes of samples, not {wanted}")
+            return
+        self._last_arrival_s = time.monotonic()
+        rate = run.hello.sample_rate_hz
+        self.drift.take((header.first_sample + header.n_samples) / rate, self._last_arrival_s)
+        self.notice = header.notice
+        values = np.frombuffer(frames[1], dtype="<f4").reshape(header.n_samples, len(run.channels))
+        ranges = np.array([self._ranges_by_name.get(c.name, np.inf) for c in run.channels])
+        block = make_block(
+            header.first_sample + run.offset, rate, values, run.channels, ranges,
+            config_id=header.config_id, control_on=header.control_on, commands_applied=header.commands_applied,
+        )  # fmt: skip
+        yield from run.arrivals.take(block, header.sequence)
 
-    def blocks(self) -> Iterator[Block]:
-        """Blocks of the rig; see `RigGateway.blocks`."""
-        return self.gateway.blocks(self.is_alive)
+    def _complain(self, what: str) -> None:
+        self.malformed += 1
+        if self.malformed <= 10:  # a flood of garbage must not become a flood of events
+            self._events.append(what)
 
 
-def _ended(process: subprocess.Popen[bytes], within_s: float = 2.0) -> bool:
-    try:
-        process.wait(timeout=within_s)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
+def _first(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    return f"{'.'.join(str(part) for part in problem['loc']) or 'message'}: {problem['msg']}"

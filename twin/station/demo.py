@@ -15,7 +15,7 @@ from twin.plant.config import DampingTable
 from twin.plant.errors import RunError
 from twin.plant.files import load_plant
 from twin.plant.linear import Array
-from twin.rig.gateway import EmbeddedRig
+from twin.rig.embedded import EmbeddedRig
 from twin.rig.programme import Programme, Sweep
 
 if TYPE_CHECKING:

@@ -1,0 +1,327 @@
+"""A simulated rig behind the live wire: samples out, commands in, and safe when its station is lost.
+
+The rig's only clock is its sample count. At ``speed`` 1 blocks leave at the rate of a real rig; at ``speed`` 0
+they leave as fast as the station's heartbeats allow, which makes a run repeatable whatever else the machine does.
+"""
+
+import contextlib
+import json
+import secrets
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+import zmq
+from pydantic import ValidationError
+from zmq.auth.thread import ThreadAuthenticator
+
+from twin.control.schedule import Acknowledgement, Command
+from twin.plant.errors import InputError, RunError
+from twin.rig.messages import VERSION, Hello, SamplesHeader, WireChannel
+from twin.rig.simulated import SimulatedRig
+from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_server
+
+HEARTBEAT_TIMEOUT_S = 0.5
+"""Without a heartbeat for so long the rig switches its controller off."""
+
+STALE_S = 1.0
+"""A command due longer ago than this was meant for another situation; only switching off is never too late."""
+
+LEAD_BLOCKS = 2
+"""Blocks the rig may be ahead of what the station has worked through, when it does not keep real time."""
+
+START_TIMEOUT_S = 60.0
+STATION_SILENT_S = 30.0
+HELLO_EVERY_S = 0.02
+HELLO_EVERY_STREAMING_S = 1.0
+
+
+class _KnownStations:
+    """Let the listed public keys in and nobody else."""
+
+    def __init__(self, public: Collection[bytes]) -> None:
+        self._public = frozenset(public)
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Answer the authenticator."""
+        return key in self._public
+
+
+class RigServer:
+    """Serve one `SimulatedRig` until its programme ends or whoever started it is gone.
+
+    Parameters
+    ----------
+    rig
+        What to serve.
+    keys
+        The rig's own.
+    stations
+        Public keys that may connect.
+    speed
+        1 keeps real time, 0 goes as fast as the station follows.
+    host, samples_port, commands_port
+        Where to bind; port 0 takes a free one.
+    stands_alone
+        A rig of its own: it runs whether a station is there or not, and stations come and go. Otherwise it waits
+        for one station, and ends with it.
+    starter_gone
+        Whether nobody is left who would miss this rig.
+
+    Raises
+    ------
+    InputError
+        If it cannot bind.
+    """
+
+    def __init__(
+        self,
+        rig: SimulatedRig,
+        keys: KeyPair,
+        stations: Collection[bytes],
+        speed: float,
+        *,
+        host: str = "127.0.0.1",
+        samples_port: int = 0,
+        commands_port: int = 0,
+        stands_alone: bool = False,
+        starter_gone: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.rig, self.speed = rig, speed
+        self._stands_alone, self._starter_gone = stands_alone, starter_gone
+        self._context = zmq.Context()
+        self._authenticator = ThreadAuthenticator(self._context)
+        self._authenticator.start()
+        self._authenticator.configure_curve_callback("rig", _KnownStations(stations))
+        self._samples = self._context.socket(zmq.PUB)
+        # A slow station is held back by its heartbeats; a rig of its own waits for nobody.
+        self._samples.sndhwm = 600 if stands_alone else 0
+        self._commands = self._context.socket(zmq.ROUTER)
+        for socket in (self._samples, self._commands):
+            guard_server(socket, keys)
+        try:
+            self.samples_port = _bind(self._samples, host, samples_port)
+            self.commands_port = _bind(self._commands, host, commands_port)
+        except InputError:
+            self._close()
+            raise
+        self._run_id = secrets.token_hex(8)
+        self._station: bytes | None = None
+        self._heard_sample = 0
+        self._started = self._stopped = self._fallen_back = False
+        self._station_sample = self._last_command = 0
+        self._early: list[Acknowledgement] = []
+        self._hello_due = 0.0
+
+    def run(self) -> None:
+        """Run the programme, with or without waiting for a station, and say goodbye.
+
+        Raises
+        ------
+        RunError
+            If no station comes or the station falls silent, where the rig depends on one.
+        """
+        try:
+            if not self._stands_alone:
+                self._await(lambda: self._started, START_TIMEOUT_S, "no station came", hello=True)
+            self._stream()
+            self._samples.send_multipart([TOPIC_END, encode({"next_sample": self.rig.next_sample})])
+            if not self._stands_alone:
+                self._await(lambda: self._stopped, STATION_SILENT_S, "the station did not take its leave")
+        finally:
+            self._close()
+
+    def _close(self) -> None:
+        self._authenticator.stop()
+        self._context.destroy(linger=200)
+
+    def _await(
+        self, done: Callable[[], bool], timeout_s: float, complaint: str, *, hello: bool = False
+    ) -> None:
+        end = time.monotonic() + timeout_s
+        while not done() and not self._stopped:
+            if hello:
+                self._say_hello()
+            self._poll(HELLO_EVERY_S)
+            if self._starter_gone():
+                raise RunError("the starter of this rig is gone")
+            if time.monotonic() > end:
+                raise RunError(f"{complaint} within {timeout_s:.0f} s")
+
+    def _stream(self) -> None:
+        programme = self.rig.programme
+        begin = time.monotonic()
+        sequence = 0
+        while not self.rig.finished and not self._stopped:
+            if self.speed > 0.0:
+                self._poll(0.0)
+                self._watch_the_station()
+            else:
+                lead = LEAD_BLOCKS * programme.block_samples
+                self._await(
+                    lambda lead=lead: self.rig.next_sample - self._station_sample <= lead,  # type: ignore[misc]
+                    STATION_SILENT_S,
+                    "the station fell silent",
+                )
+            if time.monotonic() >= self._hello_due:
+                self._say_hello()
+                self._hello_due = time.monotonic() + HELLO_EVERY_STREAMING_S
+            first = self.rig.next_sample
+            values, control_on, acknowledgements = self.rig.next_block()
+            self._fallen_back = self._fallen_back and not self.rig.control_enabled
+            if self.speed > 0.0:
+                due = begin + (sequence + 1) * programme.block_s / self.speed
+                while (left := due - time.monotonic()) > 0.0:
+                    self._poll(left)
+            header = SamplesHeader(
+                run_id=self._run_id,
+                sequence=sequence,
+                first_sample=first,
+                n_samples=len(values),
+                config_id=programme.plant.fingerprint,
+                control_on=control_on,
+                commands_applied=tuple(a.command_id for a in acknowledgements if a.accepted),
+                notice=self.rig.tripped or ("station lost: control off" if self._fallen_back else ""),
+            )
+            samples = values.astype("<f4").tobytes()
+            self._samples.send_multipart([TOPIC_SAMPLES, header.model_dump_json().encode(), samples])
+            for acknowledgement in acknowledgements:
+                self._answer(self._station, {"type": "ack", **acknowledgement.model_dump()})
+            sequence += 1
+            if self._starter_gone():
+                raise RunError("the starter of this rig is gone")
+
+    def _watch_the_station(self) -> None:
+        """Switch control off so early that the coming block ends within the time a station may be silent."""
+        programme = self.rig.programme
+        silent = self.rig.next_sample + programme.block_samples - self._heard_sample
+        if silent > HEARTBEAT_TIMEOUT_S * programme.sample_rate_hz:
+            # Safe gains: none. What the station last ordered may not fit what the rig does by now.
+            if self.rig.control_enabled:
+                self.rig.control_enabled, self._fallen_back = False, True
+            self._station = None if self._stands_alone else self._station
+
+    def _say_hello(self) -> None:
+        programme = self.rig.programme
+        hello = Hello(
+            version=VERSION,
+            run_id=self._run_id,
+            sample_rate_hz=programme.sample_rate_hz,
+            block_samples=programme.block_samples,
+            channels=tuple(WireChannel(name=c.name, unit=c.unit) for c in self.rig.channels),
+            plant=programme.plant.name,
+            config_id=programme.plant.fingerprint,
+            schedule=self.rig.schedule,
+            measurement=programme.measurement,
+            loop_delay_samples=programme.loop_delay_samples,
+            waits_for_start=not self._stands_alone,
+        )
+        self._samples.send_multipart([TOPIC_HELLO, hello.model_dump_json().encode()])
+
+    def _poll(self, timeout_s: float) -> None:
+        if self._commands.poll(max(0, round(timeout_s * 1e3))):
+            with contextlib.suppress(zmq.Again):
+                while True:
+                    sender, *frames = self._commands.recv_multipart(flags=zmq.NOBLOCK)
+                    self._take(sender, frames)
+
+    def _take(self, sender: bytes, frames: list[bytes]) -> None:
+        try:
+            message = decode(frames[0]) if len(frames) == 1 else {}
+        except RunError as error:
+            self._answer(sender, {"type": "refused", "reason": str(error)})
+            return
+        kind = message.get("type")
+        if kind not in ("start", "stop", "heartbeat", "command"):
+            self._answer(sender, {"type": "refused", "reason": "unknown message"})
+            return
+        if self._station is None and kind != "stop":
+            self._station = sender  # whoever speaks first has the controls, until leaving or falling silent
+            self._last_command = 0
+        if sender != self._station:
+            if kind == "command":
+                self._answer(sender, _refusal(message.get("command"), "another station has the controls"))
+            elif kind == "start":
+                self._answer(sender, {"type": "refused", "reason": "another station has the controls"})
+            return
+        match kind:
+            case "start":
+                self._started = True
+                self._heard_sample = self.rig.next_sample
+            case "stop":
+                self._leave()
+            case "heartbeat" if _whole(message.get("next_sample")):
+                told = min(message["next_sample"], self.rig.next_sample)  # nobody is ahead of the rig
+                if told > self._station_sample:  # one that repeats itself has stopped working
+                    self._station_sample, self._heard_sample = told, self.rig.next_sample
+            case "command":
+                self._command(sender, message.get("command"))
+            case _:
+                self._answer(sender, {"type": "refused", "reason": "a heartbeat needs a whole next_sample"})
+
+    def _leave(self) -> None:
+        if not self._stands_alone:
+            self._stopped = True
+            return
+        self._station = None
+        if self.rig.control_enabled:
+            self.rig.control_enabled, self._fallen_back = False, True
+
+    def _command(self, sender: bytes, body: object) -> None:
+        try:
+            command = Command.model_validate_json(json.dumps(body))
+        except ValidationError as error:
+            problem = error.errors()[0]["msg"]
+            reason = f"malformed command: {error.error_count()} problems, first: {problem}"
+            self._answer(sender, _refusal(body, reason))
+            return
+        reason = self._objection(command)
+        if reason:
+            self._answer(sender, _refusal(body, reason))
+            return
+        self._last_command = command.command_id
+        self.rig.accept(command)
+
+    def _objection(self, command: Command) -> str:
+        rig = self.rig
+        if command.command_id <= self._last_command:
+            return (
+                f"command {command.command_id} follows command {self._last_command}: repeated or out of order"
+            )
+        if command.config_id and command.config_id != rig.programme.plant.fingerprint:
+            return (
+                f"command {command.command_id} was made for model {command.config_id}, "
+                f"this rig is set up for {rig.programme.plant.fingerprint}"
+            )
+        late_s = (rig.next_sample - command.apply_at_sample) / rig.programme.sample_rate_hz
+        only_off = command.schedule is None and command.control_enabled is False
+        if self.speed > 0.0 and late_s > STALE_S and not only_off:
+            return f"command {command.command_id} is stale: it was due {late_s:.1f} s ago"
+        return ""
+
+    def _answer(self, station: bytes | None, message: dict[str, Any]) -> None:
+        if station is not None:
+            with contextlib.suppress(zmq.Again):
+                self._commands.send_multipart([station, encode(message)], flags=zmq.NOBLOCK)
+
+
+def _bind(socket: "zmq.Socket[bytes]", host: str, port: int) -> int:
+    try:
+        if port == 0:
+            return int(socket.bind_to_random_port(f"tcp://{host}"))
+        socket.bind(f"tcp://{host}:{port}")
+    except zmq.ZMQError as error:
+        raise InputError(
+            f"the rig cannot listen on {host}:{port} ({error.strerror}); choose another --port or --bind"
+        ) from error
+    return port
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _refusal(body: object, reason: str) -> dict[str, Any]:
+    number = body.get("command_id", 0) if isinstance(body, dict) else 0
+    refused = Acknowledgement(command_id=number if _whole(number) else 0, accepted=False, reason=reason)
+    return {"type": "ack", **refused.model_dump()}
