@@ -1,4 +1,9 @@
-"""Compiled kernels of the estimators: what runs per sample."""
+"""Compiled kernels of the estimators: what runs per sample.
+
+Innovations are sequential in both kernels of the observer: each sensor's is what the sensors before it in the same
+sample leave unexplained, so that normalised they are independent standard normals and their squares add up to the
+joint NIS. The joint one-step prediction error, before any sensor of the sample, is kept beside them.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,6 +11,15 @@ from numpy.typing import NDArray
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
 from twin.plant.stretches import STRETCH, add_product, recursion
+
+STATISTICS = 9
+COUNT, SUM, SQUARES, VARIANCES, NIS, NORMALISED, LAGGED, PAIRS, PREDICTION = range(STATISTICS)
+"""Rows of the statistics that the observer's kernels add up per sensor: valid samples; innovations, their squares and
+the variances expected of them; normalised innovations squared, normalised innovations, products of one with the next
+and how many such pairs there were; squares of the joint one-step prediction errors."""
+
+ABSURD = 1e150
+"""Values from here on, whose squares overflow, and those that are no number are never taken in."""
 
 
 @kernel
@@ -23,6 +37,7 @@ def full_covariance_block(
     u: Array,
     z: Array,
     valid: NDArray[np.bool_],
+    last: Array,
     mean: Array,
     statistics: Array,
 ) -> None:
@@ -39,21 +54,27 @@ def full_covariance_block(
     x, P, u_before
         State (n,), covariance (n, n) and input (m,) at the sample before; on return, at the last one.
     u, z, valid
-        (N, m) inputs, (N, p) measurements, (N, p) whether to use each.
+        (N, m) inputs, (N, p) measurements, (N, p) whether to use each. What is no finite number is not used
+        either way; such an input keeps its value of the sample before.
+    last
+        (p,) normalised innovations of the sample before, NaN where there was none; on return, of the last one.
     mean
         (N, n) receives the filtered mean.
     statistics
-        (4, p) accumulates per sensor: count, squared innovations, their expected variances, NIS.
+        (STATISTICS, p) sums per sensor, added to.
     """
     n, m, p = F.shape[0], u.shape[1], H.shape[0]
-    fresh, half, gain = np.empty(n), np.empty((n, n)), np.empty(n)
+    fresh, half, gain, now = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(m)
+    prediction = np.empty(p)
     for k in range(z.shape[0]):
+        for j in range(m):
+            now[j] = u[k, j] if abs(u[k, j]) < ABSURD else u_before[j]
         for i in range(n):
             total = 0.0
             for j in range(n):
                 total += F[i, j] * x[j]
             for j in range(m):
-                total += B0[i, j] * u_before[j] + B1[i, j] * u[k, j]
+                total += B0[i, j] * u_before[j] + B1[i, j] * now[j]
             fresh[i] = total
         for i in range(n):
             x[i] = fresh[i]
@@ -70,10 +91,17 @@ def full_covariance_block(
                 P[i, j] = total + Q[i, j]
                 P[j, i] = P[i, j]
         for j in range(m):
-            u_before[j] = u[k, j]
-        # Each innovation is given the sensors before it, so that their squares add up to the joint NIS.
+            u_before[j] = now[j]
         for r in range(p):
-            if not valid[k, r]:
+            total = 0.0
+            for i in range(n):
+                total += H[r, i] * x[i]
+            for j in range(m):
+                total += D[r, j] * now[j]
+            prediction[r] = total
+        for r in range(p):
+            if not valid[k, r] or not abs(z[k, r]) < ABSURD:
+                last[r] = np.nan
                 continue
             predicted, s = 0.0, variance[r]
             for i in range(n):
@@ -84,12 +112,20 @@ def full_covariance_block(
                 gain[i] = total
                 s += H[r, i] * total
             for j in range(m):
-                predicted += D[r, j] * u[k, j]
+                predicted += D[r, j] * now[j]
             innovation = z[k, r] - predicted
-            statistics[0, r] += 1.0
-            statistics[1, r] += innovation * innovation
-            statistics[2, r] += s
-            statistics[3, r] += innovation * innovation / s
+            normalised = innovation / np.sqrt(s)
+            statistics[COUNT, r] += 1.0
+            statistics[SUM, r] += innovation
+            statistics[SQUARES, r] += innovation * innovation
+            statistics[VARIANCES, r] += s
+            statistics[NIS, r] += normalised * normalised
+            statistics[NORMALISED, r] += normalised
+            statistics[PREDICTION, r] += (z[k, r] - prediction[r]) ** 2
+            if not np.isnan(last[r]):
+                statistics[LAGGED, r] += normalised * last[r]
+                statistics[PAIRS, r] += 1.0
+            last[r] = normalised
             for i in range(n):
                 x[i] += gain[i] * (innovation / s)
             for i in range(n):
@@ -108,12 +144,13 @@ def constant_gain_block(
     H: Array,
     D: Array,
     gain: Array,
-    residual_variance: Array,
-    residual_inverse: Array,
+    root: Array,
+    whitening: Array,
     x: Array,
     u_before: Array,
     u: Array,
     z: Array,
+    last: Array,
     mean: Array,
     statistics: Array,
 ) -> None:
@@ -127,8 +164,9 @@ def constant_gain_block(
     ----------
     gain
         (n, p) steady gain.
-    residual_variance, residual_inverse
-        (p,) and (p, p): diagonal and inverse of the steady innovation covariance, for the statistics.
+    root, whitening
+        (p, p) lower triangular root of the steady innovation covariance, and its inverse: the normalised sequential
+        innovations are ``whitening @ e``, since a Cholesky factor explains each sensor by those before it.
 
     Others as `full_covariance_block`.
     """
@@ -153,10 +191,19 @@ def constant_gain_block(
             for j in range(2 * m):
                 drift_of_signals[i, j] += gain[i, r] * innovation_of_inputs[r, j]
             drift_of_signals[i, 2 * m + r] = gain[i, r]
+    normalised_of_x, normalised_of_signals = np.zeros((p, n)), np.zeros((p, 2 * m + p))
+    for r in range(p):
+        for q in range(r + 1):
+            for j in range(n):
+                normalised_of_x[r, j] += whitening[r, q] * innovation_of_x[q, j]
+            for j in range(2 * m):
+                normalised_of_signals[r, j] += whitening[r, q] * innovation_of_inputs[q, j]
+            normalised_of_signals[r, 2 * m + q] = whitening[r, q]
 
     signals, drift = np.zeros((2 * m + p, STRETCH)), np.zeros((n, STRETCH))
-    before, innovation = np.zeros((n, STRETCH)), np.zeros((p, STRETCH))
-    products = np.zeros((p, p, STRETCH))
+    # The first column of ``normalised`` is the last one of the stretch before.
+    before, normalised = np.zeros((n, STRETCH)), np.zeros((p, STRETCH + 1))
+    products, sums, lagged = np.zeros((p, p, STRETCH)), np.zeros((p, STRETCH)), np.zeros((p, STRETCH))
     for first in range(0, n_samples, STRETCH):
         count = min(STRETCH, n_samples - first)
         for k in range(count):
@@ -164,7 +211,7 @@ def constant_gain_block(
                 signals[j, k], signals[m + j, k] = u_before[j], u[first + k, j]
                 u_before[j] = u[first + k, j]
             for r in range(p):
-                signals[2 * m + r, k] = innovation[r, k] = z[first + k, r]
+                signals[2 * m + r, k] = z[first + k, r]
         drift[:] = 0.0
         add_product(drift_of_signals, signals, drift, count)
         for i in range(n):
@@ -173,24 +220,36 @@ def constant_gain_block(
         for k in range(count - 1):
             for i in range(n):
                 before[i, k + 1] = mean[first + k, i]
-        add_product(innovation_of_inputs, signals, innovation, count)
-        add_product(innovation_of_x, before, innovation, count)
         for r in range(p):
+            normalised[r, 0] = 0.0 if np.isnan(last[r]) else last[r]
+            normalised[r, 1:] = 0.0
+        add_product(normalised_of_signals, signals, normalised[:, 1:], count)
+        add_product(normalised_of_x, before, normalised[:, 1:], count)
+        for r in range(p):
+            statistics[PAIRS, r] += count - (1 if np.isnan(last[r]) else 0)
+            last[r] = normalised[r, count]
+            for k in range(count):
+                sums[r, k] += normalised[r, k + 1]
+                lagged[r, k] += normalised[r, k + 1] * normalised[r, k]
             for q in range(r + 1):
                 for k in range(count):
-                    products[r, q, k] += innovation[r, k] * innovation[q, k]
+                    products[r, q, k] += normalised[r, k + 1] * normalised[q, k + 1]
+    gram = np.zeros((p, p))
     for r in range(p):
-        statistics[0, r] += n_samples
-        statistics[2, r] += n_samples * residual_variance[r]
         for q in range(r + 1):
-            total = 0.0
-            for k in range(STRETCH):
-                total += products[r, q, k]
-            statistics[3, r] += residual_inverse[r, q] * total
-            if q == r:
-                statistics[1, r] += total
-            else:
-                statistics[3, q] += residual_inverse[q, r] * total
+            gram[r, q] = gram[q, r] = np.sum(products[r, q])
+    for r in range(p):
+        std = root[r, r]
+        statistics[COUNT, r] += n_samples
+        statistics[SUM, r] += std * np.sum(sums[r])
+        statistics[SQUARES, r] += std * std * gram[r, r]
+        statistics[VARIANCES, r] += std * std * n_samples
+        statistics[NIS, r] += gram[r, r]
+        statistics[NORMALISED, r] += np.sum(sums[r])
+        statistics[LAGGED, r] += np.sum(lagged[r])
+        for q in range(r + 1):
+            for j in range(r + 1):
+                statistics[PREDICTION, r] += root[r, q] * root[r, j] * gram[q, j]
 
 
 @kernel
@@ -219,3 +278,51 @@ def scalar_update(x: Array, P: Array, h: Array, innovation_variance_noise: float
         for j in range(n):
             P[i, j] -= g[i] * g[j] / s
     return float(innovation / np.sqrt(s))
+
+
+@kernel
+def rls3_block(theta: Array, P: Array, phi: Array, z: Array, variance: Array, forgetting: float) -> None:
+    """Recursive least squares for three parameters over a block of scalar measurements, in place.
+
+    ``z = phi theta + noise``. With a forgetting factor the covariance is divided by it before each measurement
+    (Ljung 1999, section 11.2); a Kalman filter with that fading memory does the same. Written out for the six
+    different elements of P: time goes where one sample's P waits for that of the sample before.
+
+    Parameters
+    ----------
+    theta, P
+        (3,) parameters and (3, 3) covariance; on return, after the last measurement. The upper triangle is read.
+    phi, z, variance
+        (N, 3) regressors, (N,) measurements, (N,) their noise variances. A measurement with anything that is not
+        finite, or with a variance that is not positive, is left out, and nothing is forgotten for it.
+    forgetting
+        0 to 1; with 1 everything is remembered.
+    """
+    t0, t1, t2 = theta[0], theta[1], theta[2]
+    p00, p01, p02, p11, p12, p22 = P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]
+    inflation = 1.0 / forgetting
+    for k in range(len(z)):
+        a, b, c = phi[k, 0], phi[k, 1], phi[k, 2]
+        g0 = p00 * a + p01 * b + p02 * c
+        g1 = p01 * a + p11 * b + p12 * c
+        g2 = p02 * a + p12 * b + p22 * c
+        s = (forgetting * variance[k] + a * g0) + (b * g1 + c * g2)
+        innovation = z[k] - (t0 * a + t1 * b + t2 * c)
+        if not (abs(innovation) < ABSURD and s < ABSURD and variance[k] > 0.0):
+            continue
+        step = inflation / s
+        h0, h1, h2 = g0 * step, g1 * step, g2 * step
+        innovation *= forgetting
+        t0 += h0 * innovation
+        t1 += h1 * innovation
+        t2 += h2 * innovation
+        p00 = p00 * inflation - h0 * g0
+        p01 = p01 * inflation - h0 * g1
+        p02 = p02 * inflation - h0 * g2
+        p11 = p11 * inflation - h1 * g1
+        p12 = p12 * inflation - h1 * g2
+        p22 = p22 * inflation - h2 * g2
+    theta[0], theta[1], theta[2] = t0, t1, t2
+    P[0, 0], P[0, 1], P[0, 2] = p00, p01, p02
+    P[1, 0], P[1, 1], P[1, 2] = p01, p11, p12
+    P[2, 0], P[2, 1], P[2, 2] = p02, p12, p22

@@ -13,6 +13,7 @@ from control import dare
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import expm
 
+from estimators import kernels
 from estimators.kernels import constant_gain_block, full_covariance_block
 from estimators.types import StateEstimate
 from twin.plant.blocks import Block
@@ -139,8 +140,8 @@ class Observer:
         residual = kf.H @ prior @ kf.H.T + kf.R
         self._gain = np.ascontiguousarray(np.linalg.solve(residual, kf.H @ prior).T)
         self.steady_covariance = read_only(prior - self._gain @ residual @ self._gain.T)
-        self._residual_variance = np.ascontiguousarray(np.diag(residual))
-        self._residual_inverse = np.linalg.inv(residual)
+        self._root = np.ascontiguousarray(np.linalg.cholesky(residual))
+        self._whitening = np.linalg.inv(self._root)
         self._settled, self._stretch_done = False, 0
 
     def advance(self, block: Block) -> StateEstimate:
@@ -158,7 +159,8 @@ class Observer:
             self._u_before = u[0].copy()
         x, P = kf.x[:, 0].copy(), np.ascontiguousarray(kf.P, dtype=np.float64)
         mean = np.empty((len(z), len(x)))
-        statistics = np.zeros((4, len(self.sensors)))  # count, sum of squares, sum of variances, NIS
+        statistics = np.zeros((kernels.STATISTICS, len(self.sensors)))
+        last = np.full(len(self.sensors), np.nan)
         m = len(self.sources)
         B0, B1 = np.ascontiguousarray(kf.B[:, :m]), np.ascontiguousarray(kf.B[:, m:])
         n_full = 0
@@ -168,7 +170,7 @@ class Observer:
             valid = block.valid[stretch].take(self._sensor_columns, axis=1)
             full_covariance_block(
                 kf.F, B0, B1, kf.H, self.feedthrough, kf.Q, self._variance, x, P, self._u_before,
-                u[stretch], z[stretch], valid, mean[stretch], statistics,
+                u[stretch], z[stretch], valid, last, mean[stretch], statistics,
             )  # fmt: skip
             n_full += len(valid)
             self._stretch_done += len(valid)
@@ -178,22 +180,35 @@ class Observer:
         if n_full < len(z):
             P = np.array(self.steady_covariance)
             constant_gain_block(
-                kf.F, B0, B1, kf.H, self.feedthrough, self._gain, self._residual_variance,
-                self._residual_inverse, x, self._u_before, u[n_full:], z[n_full:], mean[n_full:], statistics,
+                kf.F, B0, B1, kf.H, self.feedthrough, self._gain, self._root, self._whitening,
+                x, self._u_before, u[n_full:], z[n_full:], last, mean[n_full:], statistics,
             )  # fmt: skip
         kf.x, kf.P = x[:, None], P
         mean.flags.writeable = False
-        count, squares, expected, nis = statistics
-        with np.errstate(invalid="ignore"):
-            rms, std = np.sqrt(squares / count), np.sqrt(expected / count)
+        return self._estimate(mean, P, statistics)
+
+    def _estimate(self, mean: Array, P: Array, sums: Array) -> StateEstimate:
+        count, pairs = sums[kernels.COUNT], sums[kernels.PAIRS]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normalised_mean = sums[kernels.NORMALISED] / count
+            nis = sums[kernels.NIS] / count
+            lag1 = (sums[kernels.LAGGED] / pairs - normalised_mean**2) / (nis - normalised_mean**2)
+            means = {
+                "innovation_rms": np.sqrt(sums[kernels.SQUARES] / count),
+                "innovation_std": np.sqrt(sums[kernels.VARIANCES] / count),
+                "innovation_mean": sums[kernels.SUM] / count,
+                "prediction_rms": np.sqrt(sums[kernels.PREDICTION] / count),
+            }
         return StateEstimate(
             states=self.states,
             mean=mean,
             covariance=read_only(P),
-            innovation_rms=read_only(rms),
-            innovation_std=read_only(std),
-            nis=float(nis.sum() / count.sum()) if count.sum() else float("nan"),
+            nis=float(sums[kernels.NIS].sum() / count.sum()) if count.sum() else float("nan"),
             sensors=self.sensors,
+            innovation_count=read_only(count),
+            innovation_lag1=read_only(np.where((pairs > 0) & (count > 2), np.clip(lag1, -1.0, 1.0), np.nan)),
+            nis_per_sensor=read_only(nis),
+            **{name: read_only(values) for name, values in means.items()},
         )
 
     def _is_steady(self, P: Array) -> bool:

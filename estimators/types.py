@@ -12,6 +12,10 @@ DampingStatus = Literal["unestimated", "learning", "estimated", "invalid"]
 class StateEstimate:
     """The observer's result over one block.
 
+    Innovations are sequential: each sensor's is what it says beyond the prediction and the sensors before it in the
+    same sample. Of a consistent filter they are white and independent from sensor to sensor, with the variances that
+    the filter expects. Statistics over the block are NaN for a sensor without a valid sample in it.
+
     Attributes
     ----------
     states
@@ -22,11 +26,25 @@ class StateEstimate:
         (n_states, n_states) at the block's last sample.
     innovation_rms, innovation_std
         (n_sensors,) root mean square of the innovations over the block and what the filter expected of it,
-        in the sensors' units; NaN for a sensor without a valid sample.
+        in the sensors' units.
     nis
         Mean normalised innovation squared per valid scalar measurement: 1 for a consistent filter.
     sensors
         Names of the sensors that were used.
+    innovation_count
+        (n_sensors,) valid samples.
+    innovation_mean
+        (n_sensors,) mean innovation in the sensors' units: 0 for a filter without bias.
+    innovation_lag1
+        (n_sensors,) autocorrelation coefficient of the normalised innovations, about their mean, from one valid
+        sample to the next: 0 for a consistent filter, with standard deviation 1/sqrt(count). NaN where no two
+        consecutive samples were valid.
+    nis_per_sensor
+        (n_sensors,) mean normalised innovation squared of each sensor: count times it is chi-squared with
+        count degrees of freedom.
+    prediction_rms
+        (n_sensors,) root mean square of the one-step prediction error before any sensor of the sample is used, in
+        the sensors' units; equal to ``innovation_rms`` for the first sensor.
     """
 
     states: tuple[str, ...]
@@ -36,6 +54,11 @@ class StateEstimate:
     innovation_std: Array
     nis: float
     sensors: tuple[str, ...]
+    innovation_count: Array
+    innovation_mean: Array
+    innovation_lag1: Array
+    nis_per_sensor: Array
+    prediction_rms: Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,6 +112,11 @@ def frames(plant: Plant, duration_s: float, *, block: int = BLOCK, seed: int = 1
             innovation_std=read_only(noise),
             nis=float(nis),
             sensors=names,
+            innovation_count=read_only(np.full(len(names), float(block))),
+            innovation_mean=read_only(0.0 * noise),
+            innovation_lag1=read_only(0.0 * noise),
+            nis_per_sensor=read_only(ratio**2),
+            prediction_rms=read_only(ratio * noise),
         )
         command = None
         acknowledgements: tuple[Acknowledgement, ...] = ()

@@ -23,7 +23,7 @@ class Score:
     Attributes
     ----------
     nrmse
-        rms(innovation) / std(measured), over the scored rows.
+        rms(prediction error) / std(measured), over the scored rows.
     nrmse_without_input
         The same for an observer that knows no input; None where no input is recorded.
     rows
@@ -80,9 +80,9 @@ class PredictionScore:
             sums[0] += len(y)
             sums[1] += float(np.sum(y))
             sums[2] += float(np.sum(y * y))
-            sums[3] += len(y) * float(estimate.innovation_rms[row]) ** 2
+            sums[3] += len(y) * float(estimate.prediction_rms[row]) ** 2
             if blind is not None and sensor in blind.sensors:
-                sums[4] += len(y) * float(blind.innovation_rms[blind.sensors.index(sensor)]) ** 2
+                sums[4] += len(y) * float(blind.prediction_rms[blind.sensors.index(sensor)]) ** 2
 
     def scores(self) -> tuple[Score, ...]:
         """One score per sensor that was seen."""
