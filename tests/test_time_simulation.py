@@ -25,8 +25,8 @@ from twin.plant.config import DampingTable, ForceActuator, Plant, VoiceCoil
 from twin.plant.discrete import discretise
 from twin.plant.files import load_plant
 from twin.plant.linear import linear_model
-from twin.rig.excitation import Step, Steps, Sweep, Tone, exciter
 from twin.rig.embedded import EmbeddedRig
+from twin.rig.excitation import Shuttle, Span, Step, Steps, Sweep, Tone, exciter
 from twin.rig.programme import Programme, with_accelerometers
 from twin.rig.simulated import SimulatedRig
 
@@ -645,3 +645,24 @@ def test_accelerometers_are_added_only_where_they_are_missing(rig: Plant) -> Non
     assert isinstance(added.voice_coil, VoiceCoil)
     with pytest.raises(ValueError, match="has no voice coil"):
         with_accelerometers(load_plant("engine"), 1.0)
+
+
+@pytest.mark.parametrize("leg_s", [0.37, 2.0])
+def test_shuttle_goes_to_and_fro_in_phase_however_it_is_cut(leg_s: float) -> None:
+    fs, shuttle = 5_000.0, Shuttle(from_hz=47.0, to_hz=53.0, leg_s=leg_s, duration_s=10.0, amplitude_n=2.0)
+    n = int(4.5 * leg_s * fs)
+    whole = shuttle.samples(0, n, fs)
+    cut = np.concatenate([shuttle.samples(a, min(777, n - a), fs) for a in range(0, n, 777)])
+    np.testing.assert_allclose(cut, whole, atol=1e-12)
+    # The phase is the integral of the frequency: summed here by the trapezoidal rule.
+    hz = np.array([shuttle.frequency_at(k, fs) for k in range(n)])
+    turns = np.concatenate([[0.0], np.cumsum(0.5 * (hz[1:] + hz[:-1]) / fs)])
+    np.testing.assert_allclose(whole, 2.0 * np.sin(2.0 * np.pi * turns), atol=2e-3)
+    assert hz.min() == pytest.approx(47.0, abs=0.01)
+    assert hz.max() == pytest.approx(53.0, abs=0.01)
+    spans = shuttle.spans(0, n, fs)
+    assert [s.first for s in spans] == [0, *(s.stop for s in spans[:-1])]
+    assert len(spans) == 5
+    for span in spans:
+        np.testing.assert_allclose(span.from_hz, hz[span.first], atol=1e-9)
+    assert shuttle.spans(100, 50, fs) == [Span(100, 150, hz[100], hz[150])]

@@ -217,7 +217,12 @@ def test_rig_in_real_time_without_heartbeats_falls_back_to_no_control() -> None:
                 # The operator's station is back and switches control on again. It boasts, but nobody can have
                 # worked through what has not been sent: that must not keep the watch from acting later.
                 rig.gateway.heartbeat(10**12)
-                rig.gateway.send(Command(command_id=1, apply_at_sample=0, control_enabled=True))
+                due = block.end_sample
+                rig.gateway.send(Command(command_id=1, apply_at_sample=due, control_enabled=True))
+                # Refused: repeated, out of date, for another rig; switching off alone is never too late.
+                rig.gateway.send(Command(command_id=1, apply_at_sample=due, control_enabled=True))
+                rig.gateway.send(Command(command_id=2, apply_at_sample=0, control_enabled=True))
+                rig.gateway.send(Command(command_id=3, apply_at_sample=due, config_id="0123"))
         answers = {a.command_id: a for a in rig.gateway.acknowledgements() if not a.accepted}
     assert "repeated or out of order" in answers[1].reason
     assert "stale: it was due 1." in answers[2].reason

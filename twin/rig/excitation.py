@@ -22,6 +22,9 @@ from pydantic import (
 from twin.plant.config import Actuator, Frozen, Name, Plant, Positive, Shaker
 from twin.plant.linear import Array
 
+DAY_S = 86_400.0
+"""What lasts longer than this is meant to go on for ever."""
+
 AMPLITUDES = {"amplitude_v": "V", "amplitude_n": "N", "amplitude_a": "A"}
 
 
@@ -122,7 +125,58 @@ class Tone(_Sine):
     @property
     def description(self) -> str:
         """What it does, in words."""
-        return f"{self.frequency_hz:g} Hz for {self.duration_s:g} s"
+        return f"{self.frequency_hz:g} Hz" + (
+            f" for {self.duration_s:g} s" if self.duration_s <= DAY_S else ""
+        )
+
+
+class Shuttle(_Sine):
+    """Frequency that moves linearly from one end to the other and back again, over and over.
+
+    Attributes
+    ----------
+    leg_s
+        Time from one end to the other [s].
+    """
+
+    from_hz: Positive
+    to_hz: Positive
+    leg_s: Positive
+    duration_s: Positive
+
+    def frequency_at(self, sample: int, sample_rate_hz: float) -> float:
+        """Frequency at a sample [Hz]."""
+        leg, t = divmod(sample / sample_rate_hz, self.leg_s)
+        begin, end = (self.from_hz, self.to_hz) if int(leg) % 2 == 0 else (self.to_hz, self.from_hz)
+        return begin + (end - begin) * t / self.leg_s
+
+    def samples(self, first: int, n: int, sample_rate_hz: float) -> Array:
+        """Values at ``n`` samples from ``first`` on, (n,), in ``unit``."""
+        leg, t = np.divmod((first + np.arange(n)) / sample_rate_hz, self.leg_s)
+        there = np.mod(leg, 2.0) == 0.0
+        begin = np.where(there, self.from_hz, self.to_hz)
+        rate = np.where(there, 1.0, -1.0) * (self.to_hz - self.from_hz) / self.leg_s
+        # Every leg adds the same number of turns; its whole ones are dropped before they cost digits.
+        turns = np.mod(leg * np.mod(0.5 * (self.from_hz + self.to_hz) * self.leg_s, 1.0), 1.0)
+        return np.asarray(self.amplitude * np.sin(2.0 * np.pi * (turns + (begin + 0.5 * rate * t) * t)))
+
+    def spans(self, first: int, n: int, sample_rate_hz: float) -> list[Span]:
+        """The samples ``[first, first + n)``, cut where the frequency turns round."""
+        legs = range(
+            *(math.ceil(sample / sample_rate_hz / self.leg_s) + 1 for sample in (first - 1, first + n))
+        )
+        turns = (math.ceil(k * self.leg_s * sample_rate_hz - 1e-6) for k in legs)
+        cuts = [first, *dict.fromkeys(turn for turn in turns if first < turn < first + n), first + n]
+        return [
+            Span(a, b, *(self.frequency_at(sample, sample_rate_hz) for sample in (a, b)))
+            for a, b in pairwise(cuts)
+        ]
+
+    @property
+    def description(self) -> str:
+        """What it does, in words."""
+        there_and_back = f"{self.from_hz:g} to {self.to_hz:g} Hz and back, {self.leg_s:g} s each way"
+        return there_and_back if self.duration_s > DAY_S else f"{there_and_back}, for {self.duration_s:g} s"
 
 
 class Step(Frozen):
@@ -177,19 +231,25 @@ class Steps(_Sine):
         return ", ".join(f"{step.frequency_hz:g} Hz for {step.duration_s:g} s" for step in self.steps)
 
 
+_FORMS = {"steps": "steps", "frequency_hz": "tone", "leg_s": "shuttle"}
+
+
 def _form(value: Any) -> str:
     keys = set(value) if isinstance(value, dict) else set(type(value).model_fields)
-    return "steps" if "steps" in keys else "tone" if "frequency_hz" in keys else "sweep"
+    return next((form for key, form in _FORMS.items() if key in keys), "sweep")
 
 
 # Told apart by form, so that a mistake is explained for the form that was meant.
 Excitation = Annotated[
-    Annotated[Sweep, Tag("sweep")] | Annotated[Steps, Tag("steps")] | Annotated[Tone, Tag("tone")],
+    Annotated[Sweep, Tag("sweep")]
+    | Annotated[Steps, Tag("steps")]
+    | Annotated[Tone, Tag("tone")]
+    | Annotated[Shuttle, Tag("shuttle")],
     Discriminator(_form),
 ]
 
 
-def exciter(plant: Plant, excitation: Sweep | Steps | Tone) -> Actuator:
+def exciter(plant: Plant, excitation: Sweep | Steps | Tone | Shuttle) -> Actuator:
     """Actuator that an excitation drives.
 
     Raises

@@ -57,6 +57,14 @@ class MeasurementName(StrEnum):
     ABSOLUTE = "absolute"
 
 
+class PatternName(StrEnum):
+    """Excitations of ``atmd rig``."""
+
+    SWEEP = "sweep"
+    SHUTTLE = "shuttle"
+    TONE = "tone"
+
+
 class Interrupted(BaseException):
     """The person pressed Ctrl-C. Its own kind: the command-line library ends silently on KeyboardInterrupt."""
 
@@ -285,6 +293,85 @@ def analyse(
     report(run_analysis(options), lambda r: analysis_table(r, options), json_to)
 
 
+@app.command(epilog="Example: atmd keys station --dir keys   ·   atmd keys rig --dir keys")
+def keys(
+    name: Annotated[str, typer.Argument(help="Whose key it is, such as rig or station.", show_default=False)],
+    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="Where to put both halves.")] = Path(
+        "keys"
+    ),
+) -> None:
+    """Make a key pair for the wire between rig and station.
+
+    NAME.key is the public half: give it to the other side. NAME.key_secret stays where it is used and is readable
+    by you alone. Both are ZeroMQ certificates (CURVE, Z85).
+    """
+    from twin.rig.keys import make_keys
+
+    public = make_keys(folder, name)
+    say(f"public, for the other side: {public}")
+    say(f"secret, stays here:         {public.with_suffix('.key_secret')}")
+
+
+@app.command(
+    epilog="Example: atmd rig --keys keys/rig.key_secret --station keys/station.key   ·   "
+    "then: atmd live tcp://127.0.0.1:5555 --plant rig --keys keys/station.key_secret --rig keys/rig.key"
+)
+def rig(
+    keys: Annotated[
+        Path, typer.Option(metavar="FILE.key_secret", help="The rig's own key.", show_default=False)
+    ],
+    station: Annotated[
+        list[Path],
+        typer.Option(metavar="FILE.key", help="Public key of a station that may connect; may be repeated."),
+    ],
+    plant: Annotated[
+        str, typer.Option(metavar="PRESET|FILE", help="Plant with a coil on an absorber.")
+    ] = "rig",
+    bind: Annotated[str, typer.Option(metavar="HOST", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65534, help="Port of the samples; commands have the next one.")
+    ] = 5555,
+    pattern: Annotated[
+        PatternName, typer.Option(help="Excitation: one sweep, to and fro without end, or one frequency.")
+    ] = PatternName.SHUTTLE,
+    band: Annotated[
+        str, typer.Option(metavar="FROM:TO", help="Excitation frequencies in Hz; a tone stays at FROM.")
+    ] = "40:60",
+    seconds: Annotated[float, typer.Option(min=1.0, help="Time from one end to the other, in s.")] = 60.0,
+    amplitude: Annotated[
+        float,
+        typer.Option(
+            min=1e-9, help="Peak of the excitation in the exciter's unit: V of a shaker, N of a force."
+        ),
+    ] = 4.0,
+    control: Annotated[
+        str, typer.Option(metavar="FROM:TO", help="Frequencies in Hz between which the controller acts.")
+    ] = "45:55",
+    high_pass_hz: Annotated[
+        float,
+        typer.Option(min=0.01, help="High-pass the rig starts with, in Hz; the low-pass is paired with it."),
+    ] = 2.5,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="1 keeps real time.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the sensor noise.")] = 0,
+) -> None:
+    """Run the simulated rig as a program of its own, until Ctrl-C or the end of its sweep.
+
+    It speaks the protocol of a real rig, obeys commands at block boundaries, enforces its plant's limits whatever it
+    is told, and switches its controller off 0.5 s after it last heard of its station.
+    """
+    from twin.station.rig import RigOptions, rig_programme, serve
+
+    options = RigOptions(
+        plant, keys, tuple(station), bind, port, pattern.value, *_two_hz("--band", band), seconds, amplitude,
+        _two_hz("--control", control), high_pass_hz, speed, seed,
+    )  # fmt: skip
+    programme = rig_programme(options)
+    server = serve(options, programme)
+    say(f"rig '{programme.plant.name}' ({programme.plant.fingerprint}): {programme.sweep.description}")
+    say(f"samples on tcp://{bind}:{server.samples_port}, commands on tcp://{bind}:{server.commands_port}")
+    server.run()
+
+
 @app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")
 def validate(
     report_to: Annotated[
@@ -402,6 +489,14 @@ def _channel_options(options: list[str]) -> dict[str, str]:
             raise InputError(f"--channel {option}: write NAME=ARRAY:UNIT, such as tip_displacement=y:mm")
         pairs[name] = array
     return pairs
+
+
+def _two_hz(option: str, text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise InputError(f"{option} {text}: write FROM:TO in Hz, such as 45:55") from None
+    return low, high
 
 
 def _must_be_rrd(path: Path | None) -> None:
