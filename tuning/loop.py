@@ -1,7 +1,7 @@
 """The rig's closed loop as it is deployed: sampled plant, filter chain, delay, gains.
 
-Everything here is exact for the sampled system: the plant with its converter's hold, the discrete filter chain,
-whole samples of delay. Stability is judged by the closed loop's eigenvalues, never by a fitted delay.
+Everything here is exact for the sampled system: the plant with its converter's hold, the discrete filter chain, and
+a delay of any length. Stability is judged by the closed loop's eigenvalues, never by a fitted delay.
 """
 
 import math
@@ -10,12 +10,16 @@ from dataclasses import dataclass
 import control
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
 from twin.control.chain import CHAIN_STATES, chain_matrices, chain_response
 from twin.control.schedule import Gains
 from twin.plant.config import Plant, Shaker
 from twin.plant.discrete import DiscreteModel, discretise
 from twin.plant.linear import Array, ComplexArray, linear_model
+
+WELL_CONDITIONED = 1e9
+"""Eigenvectors worse than this are not trusted for responses; the state equation is then solved point by point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,15 +28,50 @@ class LoopFacts:
 
     Attributes
     ----------
+    sample_rate_hz
+        Of the controller [Hz].
     delay_samples
-        Samples between measuring and the converter's update.
+        Whole samples between measuring and the converter's update.
     relative
         True if both accelerometers form the difference, False if the absorber's alone stands for it.
+    delay_fraction
+        What the delay is longer by, as a share of a sample, from 0 up to but not 1: the converter then updates
+        between two samples. The hold itself is no part of the delay.
+
+    Raises
+    ------
+    ValueError
+        For a rate that is not above zero, or a delay that is not a number of samples.
     """
 
     sample_rate_hz: float
     delay_samples: int
     relative: bool = True
+    delay_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sample_rate_hz < math.inf:
+            raise ValueError(f"the sample rate must be above 0 Hz, got {self.sample_rate_hz:g}")
+        if self.delay_samples < 0 or not 0.0 <= self.delay_fraction < 1.0:
+            raise ValueError(
+                f"a delay is whole samples from 0 and a fraction from 0 to below 1, got {self.delay_samples} and "
+                f"{self.delay_fraction:g}"
+            )
+
+    @property
+    def delay_s(self) -> float:
+        """Time between measuring and the converter's update [s]."""
+        return (self.delay_samples + self.delay_fraction) / self.sample_rate_hz
+
+
+def loop_facts(sample_rate_hz: float, delay_s: float, relative: bool = True) -> LoopFacts:
+    """Facts of a loop with a delay of any length [s]; a rounding off a whole sample is that sample."""
+    samples = delay_s * sample_rate_hz
+    nearest = round(samples)
+    if abs(samples - nearest) < 1e-6:
+        return LoopFacts(sample_rate_hz, nearest, relative)
+    whole = math.floor(samples)
+    return LoopFacts(sample_rate_hz, whole, relative, samples - whole)
 
 
 class RigModel:
@@ -46,6 +85,11 @@ class RigModel:
         Where damping against frequency is read [Hz].
     damping_ns_m
         Absorber damping in place of the plant's own [Ns/m].
+
+    Raises
+    ------
+    ValueError
+        If the plant has no such coil, the coil no current loop, or nothing excites the plant.
     """
 
     def __init__(
@@ -75,30 +119,91 @@ class RigModel:
         rows = np.zeros((4, len(model.states)))
         feed = np.zeros((4, len(plant.actuator)))
         rows[0, x[plant.primary.name]] = 1.0
-        rows[1, x[first]], rows[1, x[second]] = 1.0, -1.0
-        weight = 1.0 if facts.relative else 0.0
-        rows[2] = weight * model.A[n + x[first]] - model.A[n + x[second]]
-        feed[2] = weight * model.B[n + x[first]] - model.B[n + x[second]]
+        for name, sign in ((first, 1.0), (second, -1.0)):
+            if name not in x:
+                continue  # the ground stands still
+            rows[1, x[name]] = sign
+            weight = 1.0 if facts.relative or name == second else 0.0
+            rows[2] += sign * weight * model.A[n + x[name]]
+            feed[2] += sign * weight * model.B[n + x[name]]
         rows[3, model.states.index(f"i_{coil.name}")] = 1.0
         self._rows, self._feed = rows, feed
+        self._early, self._late = self._held(model.A, model.B[:, self.coil_input])
+        self._residues: ComplexArray | None = None
+        self._decays: ComplexArray | None = None
+        self._split_into_modes()
+
+    def _held(self, A: Array, b: Array) -> tuple[Array, Array]:
+        """What the last but one and the last command do to the state over a sample, (n,) each.
+
+        With a fraction of a sample of delay the converter changes from one to the other inside the sample.
+        """
+        whole = self.discrete.B0[:, self.coil_input]
+        share = self.facts.delay_fraction
+        if share == 0.0:
+            return np.zeros(len(whole)), np.asarray(whole)
+        n, dt = len(A), (1.0 - share) / self.facts.sample_rate_hz
+        block = np.zeros((n + 1, n + 1))
+        block[:n, :n], block[:n, n] = A * dt, b * dt
+        late = expm(block)[:n, n]
+        return np.asarray(whole - late), np.asarray(late)
+
+    def _split_into_modes(self) -> None:
+        """Residues (4, n, 4) of the outputs per mode for the four ways in, and the modes' factors per sample (n,)."""
+        decays, vectors = np.linalg.eig(self.discrete.F)
+        if np.linalg.cond(vectors) > WELL_CONDITIONED:
+            return
+        into = np.linalg.solve(vectors, self._ways_in().astype(np.complex128))
+        self._residues = np.asarray((self._rows @ vectors)[:, :, None] * into)
+        self._decays = np.asarray(decays, dtype=np.complex128)
+
+    def _ways_in(self) -> Array:
+        """(n, 4): what the command one and two samples ago, and the excitation one sample ago and now, do."""
+        d, j = self.discrete, self.excitation_input
+        return np.column_stack([self._late, self._early, d.B0[:, j], d.B1[:, j]])
 
     def response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Response of [x_primary, x_r, measured relative acceleration, coil current] to [i_ref, excitation].
+
+        ``i_ref`` is the reference as the controller gave it, whole samples of delay ago; the hold and a fraction of
+        a sample of delay are in the response.
 
         Returns
         -------
         ndarray
             (n_frequencies, 4, 2) in SI units per A and per unit of the excitation.
         """
-        d = self.discrete
-        z = np.exp(2j * np.pi * np.atleast_1d(np.asarray(frequency_hz, float)) / self.facts.sample_rate_hz)
-        columns = [self.coil_input, self.excitation_input]
-        drive = d.B0[:, columns] / z[:, None, None] + d.B1[:, columns]
-        state = np.linalg.solve(np.eye(len(d.F)) - d.F / z[:, None, None], drive)
-        return np.asarray(self._rows @ state + self._feed[:, columns])
+        f = np.atleast_1d(np.asarray(frequency_hz, float))
+        back = np.exp(-2j * np.pi * f / self.facts.sample_rate_hz)  # one sample
+        steps = np.stack([back, back**2, back, np.ones_like(back)], axis=-1)
+        if self._residues is not None and self._decays is not None:
+            shares = 1.0 / (1.0 - self._decays * back[:, None])
+            ways = np.einsum("fn,rnw->frw", shares, self._residues)
+        else:
+            inverse = np.linalg.solve(
+                np.eye(len(self._late)) - self.discrete.F * back[:, None, None], self._ways_in()[None]
+            )
+            ways = self._rows @ inverse
+        ways = ways * steps[:, None, :]
+        out = np.stack([ways[..., 0] + ways[..., 1], ways[..., 2] + ways[..., 3]], axis=-1)
+        reference = self._feed[:, self.coil_input] * (back[:, None] if self.facts.delay_fraction else 1.0)
+        out[..., 0] += reference
+        out[..., 1] += self._feed[:, self.excitation_input]
+        return np.asarray(out)
+
+    def acceleration(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Response of the measured relative acceleration to the reference, (n_frequencies,) [m/s² per A]."""
+        f = np.atleast_1d(np.asarray(frequency_hz, float))
+        if self._residues is None or self._decays is None:
+            return np.asarray(self.response(f)[:, 2, 0])
+        back = np.exp(-2j * np.pi * f / self.facts.sample_rate_hz)
+        shares = 1.0 / (1.0 - self._decays * back[:, None])
+        late, early = (shares @ self._residues[2, :, way] for way in (0, 1))
+        feed = self._feed[2, self.coil_input] * (back if self.facts.delay_fraction else 1.0)
+        return np.asarray((late + early * back) * back + feed)
 
     def paths(self, frequency_hz: ArrayLike, low_pass_hz: float, high_pass_hz: float) -> ComplexArray:
-        """Response of the law's three terms, delay included: measured acceleration to A per unit of gain.
+        """Response of the law's three terms, whole samples of delay included: measured acceleration to A per gain.
 
         Returns
         -------
@@ -116,32 +221,54 @@ class RigModel:
 
         The sign is that of negative feedback, so that the margins are distances of L from -1.
         """
-        acceleration = self.response(frequency_hz)[:, 2, 0]
-        return np.asarray(-acceleration[:, None] * self.paths(frequency_hz, low_pass_hz, high_pass_hz))
+        paths = self.paths(frequency_hz, low_pass_hz, high_pass_hz)
+        return np.asarray(-self.acceleration(frequency_hz)[:, None] * paths)
 
     def closed_loop(self, gains: Gains) -> control.StateSpace:
         """Closed loop from the reference's disturbance to the relative acceleration, for its poles."""
-        d, fs = self.discrete, self.facts.sample_rate_hz
-        j = [self.coil_input]
-        # x_k = F x_{k-1} + B0 u_{k-1}: the hold keeps B1 at zero for the coil, so this is the usual form.
-        plant = control.ss(d.F, d.B0[:, j], self._rows[2:3], self._feed[2:3, j], 1.0 / fs)
+        A = self.closed_loop_matrix(gains)
+        n = len(self._late)
+        into, out = np.zeros((len(A), 1)), np.zeros((1, len(A)))
+        into[:n, 0], out[0, :n] = self._late + self._early, self._rows[2]
+        return control.ss(A, into, out, [[0.0]], 1.0 / self.facts.sample_rate_hz)
+
+    def closed_loop_matrix(self, gains: Gains) -> Array:
+        """One sample of the closed loop: plant states, filter chain, commands on their way to the converter."""
+        fs, whole = self.facts.sample_rate_hz, self.facts.delay_samples
         A, B, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, fs)
-        law = np.array([[gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m]]) / self.coil.force_constant_n_a
-        delay = self.facts.delay_samples
-        shift = np.eye(delay, k=-1)
-        size = CHAIN_STATES + delay
-        chain_a, chain_b = np.zeros((size, size)), np.zeros((size, 1))
-        chain_a[:CHAIN_STATES, :CHAIN_STATES], chain_b[:CHAIN_STATES] = A, B
-        chain_a[CHAIN_STATES:, CHAIN_STATES:] = shift
-        chain_a[CHAIN_STATES, :CHAIN_STATES], chain_b[CHAIN_STATES] = law @ C, law @ D
-        out = np.zeros((1, size))
-        out[0, -1] = 1.0
-        return control.feedback(plant, control.ss(chain_a, chain_b, out, [[0.0]], 1.0 / fs), sign=1)
+        law = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m]) / self.coil.force_constant_n_a
+        n = len(self._late)
+        line = n + CHAIN_STATES
+        size = line + whole + (1 if self.facts.delay_fraction else 0)
+        # A coil behind a current loop has inductance: its reference moves no acceleration at once.
+        command = np.zeros(size)
+        command[:n], command[n:line] = (law @ D)[0] * self._rows[2], law @ C
+        out = np.zeros((size, size))
+        out[:n, :n], out[n:line, :n], out[n:line, n:line] = self.discrete.F, B * self._rows[2], A
+        for effect, age in ((self._late, whole), (self._early, whole + 1)):
+            if not effect.any():
+                continue
+            if age == 0:
+                out[:n] += np.outer(effect, command)
+            else:
+                out[:n, line + age - 1] += effect
+        if size > line:
+            out[line] = command
+            out[line + 1 :, line:-1] = np.eye(size - line - 1)
+        return out
 
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of the closed loop [1/s]: the largest real part of its poles; below 0 is stable."""
-        poles = np.abs(self.closed_loop(gains).poles())
+        poles = np.abs(np.linalg.eigvals(self.closed_loop_matrix(gains)))
         return float(np.log(poles.max()) * self.facts.sample_rate_hz)
+
+    @property
+    def modes_hz(self) -> Array:
+        """(n_modes, 2): frequency and half-width of every vibration mode of the plant without control [Hz]."""
+        decays = np.linalg.eigvals(self.discrete.F)
+        rates = np.log(decays[np.abs(decays.imag) > 1e-12 * np.abs(decays)]) * self.facts.sample_rate_hz
+        rates = rates[rates.imag > 0.0]
+        return np.column_stack([rates.imag, np.abs(rates.real)]) / math.tau
 
 
 @dataclass(frozen=True, slots=True)
