@@ -14,9 +14,11 @@ from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import Plant
 from twin.plant.errors import RunError
+from twin.plant.linear import Array
 from twin.rig.arrivals import ArrivalCounts, Arrivals
 from twin.rig.drift import ClockDrift
 from twin.rig.messages import VERSION, Hello, SamplesHeader
+from twin.rig.units import to_si, units_for
 from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_client
 
 CONNECT_TIMEOUT_S = 60.0
@@ -30,6 +32,7 @@ class _Run:
 
     hello: Hello
     channels: tuple[Channel, ...]
+    factors: Array
     offset: int = 0
     arrivals: Arrivals = field(default_factory=Arrivals)
 
@@ -249,7 +252,7 @@ class RigGateway:
             return
         run = self._run
         if run is None:
-            self._run = _Run(hello, hello.block_channels())
+            self._run = _Run(hello, *_in_si_units(hello, self._plant))
             if hello.config_id and hello.config_id != self._plant.fingerprint:
                 self._events.append(
                     f"the rig is set up for plant '{hello.plant}' ({hello.config_id}), "
@@ -269,7 +272,9 @@ class RigGateway:
         counts = self.counts
         away_s = max(0.0, time.monotonic() - self._last_arrival_s)
         following = run.arrivals.next_sample or 0
-        fresh = _Run(hello, run.channels, offset=following + round(away_s * hello.sample_rate_hz))
+        fresh = _Run(
+            hello, run.channels, run.factors, offset=following + round(away_s * hello.sample_rate_hz)
+        )
         fresh.arrivals.next_sample = following
         self._past, self._run = counts, fresh
         self.restarts += 1
@@ -299,6 +304,8 @@ class RigGateway:
         self.drift.take((header.first_sample + header.n_samples) / rate, self._last_arrival_s)
         self.notice = header.notice
         values = np.frombuffer(frames[1], dtype="<f4").reshape(header.n_samples, len(run.channels))
+        if np.any(run.factors != 1.0):
+            values = values * run.factors
         ranges = np.array([self._ranges_by_name.get(c.name, np.inf) for c in run.channels])
         block = make_block(
             header.first_sample + run.offset, rate, values, run.channels, ranges,
@@ -310,6 +317,24 @@ class RigGateway:
         self.malformed += 1
         if self.malformed <= 10:  # a flood of garbage must not become a flood of events
             self._events.append(what)
+
+
+def _in_si_units(hello: Hello, plant: Plant) -> tuple[tuple[Channel, ...], Array]:
+    """Columns as the plant knows them, in SI units, and the factor that takes each there."""
+    expected = {s.name: s.unit for s in plant.sensor} | {a.name: a.input_unit for a in plant.actuator}
+    channels, factors = [], np.ones(len(hello.channels))
+    for k, sent in enumerate(hello.channels):
+        wanted, found = expected.get(sent.name), to_si(sent.unit)
+        if wanted is not None and (found is None or found[0] != wanted):
+            raise RunError(
+                f"the rig sends channel '{sent.name}' in '{sent.unit}'; plant '{plant.name}' has it in {wanted}: "
+                f"have the rig say one of {', '.join(units_for(wanted))}"
+            )
+        unit, factors[k] = found if found is not None else (sent.unit, 1.0)
+        channels.append(Channel(sent.name, unit))
+    if len({c.name for c in channels}) < len(channels):
+        raise RunError("the rig sends two channels of the same name")
+    return tuple(channels), factors
 
 
 def _first(error: ValidationError) -> str:

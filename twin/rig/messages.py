@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from twin.control.schedule import GainSchedule
-from twin.plant.blocks import Channel
 
 VERSION: Literal[2] = 2
 MAX_BLOCK_SAMPLES = 1_000_000
@@ -21,7 +20,7 @@ class Message(BaseModel):
 
 
 class WireChannel(Message):
-    """One column of the samples: its name and the SI unit of its values."""
+    """One column of the samples: its name and the unit of its values."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
     unit: Annotated[str, Field(max_length=20)]
@@ -55,10 +54,6 @@ class Hello(Message):
     measurement: Literal["relative", "absolute"] = "relative"
     loop_delay_samples: Annotated[int, Field(ge=0, le=10_000)] = 1
     waits_for_start: bool = False
-
-    def block_channels(self) -> tuple[Channel, ...]:
-        """Columns of the blocks that will come."""
-        return tuple(Channel(c.name, c.unit) for c in self.channels)
 
 
 class SamplesHeader(Message):
