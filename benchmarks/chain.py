@@ -107,7 +107,7 @@ def run_chain(setting: Setting) -> Report:
     watched = replaying(programme, told, "steady")
     stages = _watch(watched)
     skip = round(setting.learning_s / programme.block_s)
-    every = watched.settings.retune_every_blocks
+    every = watched.settings.retuning.every_blocks
     taken: dict[str, list[float]] = {mode: [] for mode in WANTED}
     with tempfile.TemporaryDirectory() as folder:
         output = Outputs(

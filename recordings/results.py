@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from twin.station.replay import ReplayOptions, open_any
-from twin.station.session import Session
 from twin.station.summary import RunLog
 
 FOLDER = Path(__file__).resolve().parent
@@ -24,7 +23,7 @@ def replay_results(path: Path) -> dict[str, Any]:
         ``digest`` of every estimate's and every twin's bits, the same on the same machine only.
     """
     opened = open_any(path, ReplayOptions())
-    session = Session(opened.plant, opened.channels, opened.sample_rate_hz, opened.settings, opened.commands)
+    session = opened.session()
     session.warm_up()
     log, digest = RunLog(), hashlib.sha256()
     answers = list(opened.acknowledgements)

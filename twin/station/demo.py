@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,11 @@ from twin.rig.embedded import EmbeddedRig
 from twin.rig.programme import Programme, Sweep
 
 if TYPE_CHECKING:
+    from tuning.loop import LoopFacts
     from tuning.retune import TuningGoal
+    from twin.station.retuning import RetuningSettings
     from twin.station.session import Session
+    from twin.station.worker import Tuner
 
 TABLE_HZ = tuple(float(f) for f in np.arange(45.0, 55.01, 0.5))
 SWEEP_HZ = (40.0, 60.0)
@@ -76,16 +80,33 @@ def demo_programme(seconds: float, seed: int) -> Programme:
     )
 
 
-def session_for(programme: Programme, channels: tuple[Channel, ...], goal: "TuningGoal") -> "Session":
-    """Return the twin of a programme: it knows everything of it but the true damping."""
+def facts_of(programme: Programme) -> "LoopFacts":
+    """Sampling and delay of a programme's control loop."""
     from tuning.loop import LoopFacts
-    from twin.station.session import Session, SessionSettings
 
-    facts = LoopFacts(
+    return LoopFacts(
         programme.sample_rate_hz, programme.loop_delay_samples, programme.measurement == "relative"
     )
-    settings = SessionSettings(loop=facts, schedule=programme.schedule, goal=goal)
-    return Session(programme.plant, channels, programme.sample_rate_hz, settings)
+
+
+def session_for(
+    programme: Programme,
+    channels: tuple[Channel, ...],
+    goal: "TuningGoal",
+    retuning: "RetuningSettings | None" = None,
+    tuner: "Tuner | None" = None,
+) -> "Session":
+    """Return the twin of a programme: it knows everything of it but the true damping."""
+    from twin.station.retuning import RetuningSettings
+    from twin.station.session import Session, SessionSettings
+
+    settings = SessionSettings(
+        loop=facts_of(programme),
+        schedule=programme.schedule,
+        goal=goal,
+        retuning=retuning or RetuningSettings(),
+    )
+    return Session(programme.plant, channels, programme.sample_rate_hz, settings, tuner=tuner)
 
 
 def run_demo(
@@ -116,23 +137,31 @@ def run_demo(
         # The rig starts up on another core while this process loads its solvers and viewer: seconds saved.
         from tuning.retune import TuningGoal
         from twin.station.outputs import Outputs
+        from twin.station.retuning import RetuningSettings
         from twin.station.summary import RunLog
+        from twin.station.worker import TunerProcess
 
         log, in_loop_s, error = RunLog(), 0.0, ""
-        goal = TuningGoal(budget_w=options.budget_w)
-        session = session_for(programme, rig.channels, goal)
+        goal, retuning = TuningGoal(budget_w=options.budget_w), RetuningSettings()
+        # Where the rig does not wait for the twin, the twin does not wait for its tuner either.
+        lag = None if speed else retuning.lag_blocks
+        tuner = TunerProcess(programme.plant, facts_of(programme), goal, lag)
+        session = session_for(programme, rig.channels, goal, retuning, tuner)
         setup = describe_run(programme, options)
-        with Outputs(
-            session,
-            recording=options.recording,
-            setup=setup,
-            run_config_json=json.dumps(
-                {"programme": programme.model_dump(mode="json"), "session": session.configuration()}
-            ),
-            seed=options.seed,
-            window=options.window,
-            web=options.web,
-        ) as outputs:
+        with (
+            closing(tuner),
+            Outputs(
+                session,
+                recording=options.recording,
+                setup=setup,
+                run_config_json=json.dumps(
+                    {"programme": programme.model_dump(mode="json"), "session": session.configuration()}
+                ),
+                seed=options.seed,
+                window=options.window,
+                web=options.web,
+            ) as outputs,
+        ):
             if outputs.moved_aside is not None:
                 say(f"{options.recording} was there already; kept as {outputs.moved_aside}")
             if outputs.url:

@@ -1,13 +1,16 @@
 """What one turn of the loop produced, for whoever shows or keeps it."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.types import Powers, Proposal
 from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block
 from twin.plant.linear import Array
+
+if TYPE_CHECKING:
+    from twin.station.worker import Arrival
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,8 @@ class Frame:
         the order of ``estimate.sensors``.
     estimate
         The observer's.
+    asked, arrival
+        Number of the question asked of the tuner after this block, and what was taken of it at this block.
     phasors, curve, performance
         None where the plant has no such part or the block no excitation.
     """
@@ -75,3 +80,5 @@ class Frame:
     command: Command | None
     acknowledgements: tuple[Acknowledgement, ...]
     events: tuple[Event, ...]
+    asked: int | None = None
+    arrival: "Arrival | None" = None

@@ -145,6 +145,11 @@ class Outputs:
                 recorder.write_acknowledgement(answer, sample)
             for event in frame.events:
                 recorder.write_note("events", event.sample, json.dumps(asdict(event)))
+            if frame.asked is not None:
+                recorder.write_note("questions", sample, json.dumps({"number": frame.asked}))
+            if frame.arrival is not None:
+                taken = {"number": frame.arrival.number, "trouble": frame.arrival.trouble}
+                recorder.write_note("answers", sample, json.dumps(taken))
             if frame.decision is not None:
                 recorder.write_note("decisions", frame.decision.sample, json.dumps(asdict(frame.decision)))
         if self._file_view is not None:

@@ -21,6 +21,7 @@ from twin.station.outputs import Outputs
 from twin.station.prediction import PredictionScore
 from twin.station.session import Session, SessionSettings, settings_from
 from twin.station.summary import RunLog
+from twin.station.worker import AsRecorded, TunerHere, as_recorded
 
 DISTURBANCE_SAMPLES = 50_000
 """No more samples than these go into estimating an unknown disturbance."""
@@ -65,6 +66,16 @@ class Opened:
     remarks: tuple[str, ...]
     seed: int | None
     config_json: str
+    timing: AsRecorded | None = None
+
+    def session(self) -> Session:
+        """Return a fresh session for the recording, which repeats what the run's own decided."""
+        loop, tuner = self.settings.loop, None
+        if loop is not None and self.timing is not None:
+            tuner = TunerHere(self.plant, loop, self.settings.goal, self.timing)
+        return Session(
+            self.plant, self.channels, self.sample_rate_hz, self.settings, self.commands, tuner
+        )
 
 
 def run_replay(
@@ -100,13 +111,7 @@ def run_replay(
     opened = open_any(path, options)
     for remark in opened.remarks:
         say(remark)
-    session = Session(
-        opened.plant,
-        opened.channels,
-        opened.sample_rate_hz,
-        opened.settings,
-        recorded_commands=opened.commands,
-    )
+    session = opened.session()
     score = PredictionScore(
         opened.plant, opened.channels, opened.sample_rate_hz, session.observer.sources, opened.fitted_rows
     )
@@ -210,6 +215,7 @@ def _open_own(path: Path, options: ReplayOptions) -> Opened:
         remarks=tuple(remarks),
         seed=recording.seed,
         config_json=recording.run_config_json,
+        timing=as_recorded(recording.notes("questions"), recording.notes("answers")),
     )
 
 

@@ -1,0 +1,299 @@
+"""What the loop decides about gains: when to ask, which answers still hold, what is worth a command.
+
+Questions go to a `Tuner`; here is only compared and counted. What is decided depends on blocks, commands and the
+blocks at which answers came, all of which are recorded, so that a replay repeats it.
+"""
+
+from dataclasses import dataclass
+
+from estimators.damping import DampingLearner
+from estimators.types import DampingCurve, Phasors
+from tuning.retune import TuningGoal
+from tuning.stability import Instability
+from tuning.step import stiffness_terms
+from tuning.types import Proposal
+from twin.control.schedule import Acknowledgement, Command, Gains, GainSchedule
+from twin.plant.blocks import Block
+from twin.plant.config import Plant
+from twin.station.advice import Answer, Question
+from twin.station.frame import UNCHANGED, Decision, Event
+from twin.station.worker import Arrival, Tuner
+
+COMMAND_LEAD_BLOCKS = 2
+"""A command is due this many blocks after the one that led to it: time for it to reach the rig."""
+
+FORGOTTEN_BLOCKS = 20
+"""A command that the rig has neither obeyed nor refused after this many blocks is no longer waited for."""
+
+MAX_AHEAD_HZ = 3.0
+"""A jump of the excitation is no sweep: no more of the table than this is retuned ahead of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetuningSettings:
+    """When gains are asked for, and which of them become commands.
+
+    Attributes
+    ----------
+    every_blocks
+        How often proposals are asked for, if the last answer is there and no command on its way.
+    lag_blocks
+        Blocks from question to answer where the data can wait for the twin; a live rig takes answers as they come.
+    outdated_ns_m
+        A proposal is dropped if the damping in use at one of its points has moved this far since the question.
+    min_change
+        A point's gains are worth a command if one of the law's terms moves by this share of the table's largest.
+    reversal
+        And by so many times more where they would turn back on their last step: estimates scatter, plants drift.
+    longest_step
+        How far one command may move any of the law's terms, as a share of the absorber's stiffness.
+    only_if_unstable
+        Keep the gains in use for as long as they are stable.
+    """
+
+    every_blocks: int = 5
+    lag_blocks: int = 1
+    outdated_ns_m: float = 0.6
+    min_change: float = 1e-3
+    reversal: float = 4.0
+    longest_step: float = 0.1
+    only_if_unstable: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What one block brought: a question asked, an answer taken, a decision made."""
+
+    asked: int | None = None
+    arrival: Arrival | None = None
+    proposal: Proposal | None = None
+    decision: Decision | None = None
+    command: Command | None = None
+    events: tuple[Event, ...] = ()
+
+
+class Retuning:
+    """Keeps the schedule in use and decides about the next one.
+
+    Parameters
+    ----------
+    schedule
+        The one the rig starts with.
+    recorded
+        Commands of the run that is being replayed; None in a run of its own.
+
+    Attributes
+    ----------
+    schedule
+        In use at the rig, as far as its blocks tell.
+    bounds_m
+        Motion without control and the physical limit at the excitation [m], of the last answer.
+    goal
+        What is asked of the tuner; may be changed between blocks.
+    outdated
+        Proposals dropped because the model or the schedule had moved on.
+    """
+
+    def __init__(
+        self,
+        schedule: GainSchedule,
+        goal: TuningGoal,
+        settings: RetuningSettings,
+        tuner: Tuner,
+        recorded: dict[int, Command] | None,
+    ) -> None:
+        self.schedule, self.goal, self.settings = schedule, goal, settings
+        self.tuner = tuner
+        self.commands = dict(recorded or {})
+        self.bounds_m = (float("nan"), float("nan"))
+        self.outdated = 0
+        self.answer: Answer | None = None
+        self._replaying = recorded is not None
+        self._promises: dict[int, Plant] = {}
+        self._promised_by: Plant | None = None
+        self._next_command = self._next_question = 1
+        self._since_question = settings.every_blocks
+        self._on_its_way: int | None = None
+        self._way_blocks = 0
+        self._open: Question | None = None
+        self._last_step: dict[int, tuple[float, ...]] = {}
+        self._unstable: Instability | None = None
+
+    def warm_up(self, plant: Plant) -> None:
+        """Make the tuner ready; may take seconds."""
+        middle = self.schedule.frequency_hz[len(self.schedule.frequency_hz) // 2]
+        self.tuner.warm_up(self._question(0, plant, 0.1, middle, 1.0, 0.0, propose=True))
+
+    def note(self, block: Block, acknowledgements: tuple[Acknowledgement, ...]) -> None:
+        """Take in what the rig says it has done."""
+        self._way_blocks += 1
+        refused = {a.command_id for a in acknowledgements if not a.accepted}
+        for number in block.commands_applied:
+            command = self.commands.get(number)
+            if command is not None and command.schedule is not None:
+                self.schedule = command.schedule
+                self._promised_by = self._promises.pop(number, None)
+        known = self._on_its_way
+        if known in refused or known in block.commands_applied or self._way_blocks > FORGOTTEN_BLOCKS:
+            self._on_its_way = None
+
+    def turn(
+        self,
+        block: Block,
+        phasors: Phasors | None,
+        amplitude: float,
+        moved_hz: float,
+        curve: DampingCurve | None,
+        plant: Plant,
+        learner: DampingLearner,
+    ) -> Turn:
+        """Take an answer if one has come, decide about it, and ask the next question if it is time.
+
+        Parameters
+        ----------
+        amplitude
+            Peak of the excitation.
+        moved_hz
+            How far the excitation moved over this block [Hz].
+        plant
+            The plant as identified.
+        """
+        last = block.end_sample - 1
+        arrival = self.tuner.take(last)
+        done = Turn() if arrival is None else self._decide(block, arrival, plant)
+        self._since_question += 1
+        asked = None
+        if (
+            phasors is not None
+            and curve is not None
+            and self._since_question >= self.settings.every_blocks
+            and self._on_its_way is None
+            and self.tuner.ready(last)
+        ):
+            f, ahead = phasors.frequency_hz, self._look_ahead(moved_hz)
+            std = learner.std_at(f)
+            propose = curve.status != "unestimated" and self._is_near(f, ahead) and self._is_wanted()
+            self._open = self._question(last, plant, std, f, amplitude, ahead, propose=propose)
+            self.tuner.ask(self._open)
+            asked = self._next_question
+            self._next_question += 1
+            self._since_question = 0
+        return Turn(asked, arrival, done.proposal, done.decision, done.command, done.events)
+
+    def _is_wanted(self) -> bool:
+        return not self.settings.only_if_unstable or self._unstable is not None
+
+    def _question(
+        self,
+        sample: int,
+        plant: Plant,
+        std: float,
+        frequency: float,
+        amplitude: float,
+        ahead: float,
+        *,
+        propose: bool,
+    ) -> Question:
+        return Question(
+            number=self._next_question,
+            sample=sample,
+            goal=self.goal,
+            plant=plant,
+            damping_std_ns_m=std,
+            excitation_hz=frequency,
+            amplitude=amplitude,
+            ahead_hz=ahead,
+            schedule=self.schedule,
+            propose=propose,
+            longest_step=self.settings.longest_step,
+            promised_by=self._promised_by,
+        )
+
+    def _decide(self, block: Block, arrival: Arrival, plant: Plant) -> Turn:
+        last = block.end_sample - 1
+        question, self._open = self._open, None
+        answer = arrival.answer
+        if answer is None or question is None:
+            return Turn(events=(Event(last, "error", f"retuning: {arrival.trouble}"),))
+        events: list[Event] = []
+        self.answer = answer
+        self.bounds_m = (answer.passive_m, answer.limit_m)
+        if answer.unstable is not None and self._unstable is None:
+            events.append(Event(last, "warning", answer.unstable.explanation))
+        self._unstable = answer.unstable
+        proposal = answer.proposal
+        if proposal is None:
+            return Turn(events=tuple(events))
+        if proposal.reason:
+            events.append(Event(last, "warning", f"retuning: {proposal.reason}"))
+        verdict = proposal.reason if not proposal.feasible else self._outdated(question, proposal, plant)
+        steps: dict[int, Gains] = {}
+        if not verdict:
+            steps = {row: gains for row, gains in answer.steps if self._is_worth_it(row, gains)}
+            verdict = "" if steps else UNCHANGED
+        if verdict:
+            return Turn(
+                proposal=proposal,
+                decision=Decision(last, False, "automatic", verdict),
+                events=tuple(events),
+            )
+        command = Command(
+            command_id=self._next_command,
+            apply_at_sample=block.end_sample + COMMAND_LEAD_BLOCKS * block.n_samples,
+            schedule=self.schedule.with_points(steps),
+        )
+        self._next_command += 1
+        self._on_its_way, self._way_blocks = command.command_id, 0
+        self._promises[command.command_id] = question.plant
+        for row, gains in steps.items():
+            self._last_step[row] = self._step(row, gains)
+        if not self._replaying:
+            self.commands[command.command_id] = command
+        decision = Decision(last, True, "automatic", "verified and better")
+        return Turn(proposal=proposal, decision=decision, command=command, events=tuple(events))
+
+    def _outdated(self, question: Question, proposal: Proposal, plant: Plant) -> str:
+        """Why a proposal no longer fits; empty if it does."""
+        reason = ""
+        before, now = question.plant.absorber, plant.absorber
+        if question.schedule != self.schedule:
+            reason = "outdated: the gains in use have changed since it was asked for"
+        elif question.goal != self.goal:
+            reason = "outdated: the goal has changed since it was asked for"
+        elif before is not None and now is not None:
+            moved = max(
+                (abs(now.damping_at(p.frequency_hz) - before.damping_at(p.frequency_hz)))
+                for _, p in proposal.points
+            )
+            if moved > self.settings.outdated_ns_m:
+                reason = f"outdated: the damping has moved by {moved:.2f} Ns/m since it was asked for"
+        self.outdated += bool(reason)
+        return reason
+
+    def _look_ahead(self, moved_hz: float) -> float:
+        """How far the excitation moves until the proposal after this one takes effect [Hz]."""
+        blocks = self.settings.every_blocks + self.settings.lag_blocks + COMMAND_LEAD_BLOCKS + 1
+        return min(max(moved_hz * blocks, -MAX_AHEAD_HZ), MAX_AHEAD_HZ)
+
+    def _is_near(self, frequency: float, ahead: float) -> bool:
+        low, high = sorted((frequency, frequency + ahead))
+        table, reach = self.schedule.frequency_hz, self.goal.reach_hz
+        return low - reach <= table[-1] and table[0] <= high + reach
+
+    def _is_worth_it(self, row: int, gains: Gains) -> bool:
+        """Whether a point's step stands out from the table, more so where it would undo the last one."""
+        step = self._step(row, gains)
+        before = self._last_step.get(row, step)
+        turns_back = sum(a * b for a, b in zip(step, before, strict=True)) < 0.0
+        least = self.settings.min_change * (self.settings.reversal if turns_back else 1.0)
+        return max(map(abs, step)) > least
+
+    def _step(self, row: int, gains: Gains) -> tuple[float, ...]:
+        """Change of the law's terms and cutoffs at a point of the table, as shares of the largest there."""
+        f = self.schedule.frequency_hz
+        now = self.schedule.at(f[row])
+        largest = max(abs(t) for hz in f for t in stiffness_terms(self.schedule.at(hz), hz)) or 1.0
+        pairs = zip(stiffness_terms(now, f[row]), stiffness_terms(gains, f[row]), strict=True)
+        terms = [(new - old) / largest for old, new in pairs]
+        cutoffs = [gains.low_pass_hz / now.low_pass_hz - 1.0, gains.high_pass_hz / now.high_pass_hz - 1.0]
+        return (*terms, *cutoffs)
