@@ -17,7 +17,7 @@ import numpy as np
 
 from tuning.budget_sdp import BudgetProgram
 from tuning.excited import ExcitedPlant, Scaling, balance, excited_plant
-from tuning.lq_kernels import lq_point
+from tuning.multipliers import BudgetProblem, Limit, LQPoint, meet_all, meet_one
 from tuning.types import ActiveLimit
 from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
@@ -25,10 +25,6 @@ from twin.plant.linear import Array, read_only
 
 DISPLACEMENT_SCALE_M = 20e-6
 EFFORT_FLOOR = 0.01
-TIGHT = 1e-9
-"""A binding limit is used to within this share."""
-LARGEST_MULTIPLIER = 1e9
-LARGEST_RESIDUAL = 1e-7
 
 
 @dataclass(frozen=True)
@@ -103,64 +99,6 @@ class LQDesign:
             "input": "force_n",
             "relative_bandwidth": self.excited.relative_bandwidth,
         }
-
-
-@dataclass(frozen=True)
-class _Limit:
-    """A bound on a quadratic form of (x, u): mean of the form at most 1; in SI at most ``value``."""
-
-    name: str
-    form: Array
-    value: float
-    per_unit: float  # how much of the bound's share one SI unit of the limit is
-
-
-@dataclass
-class _Problem:
-    """One operating point in scaled units; counts its evaluations."""
-
-    A: Array
-    b: Array
-    noise: Array
-    objective: Array
-    limits: tuple[_Limit, ...]
-    ratios: Array
-    steepness: float
-    evaluations: int = 0
-
-    def at(self, multipliers: Array) -> "_Point":
-        """LQ optimum for some multipliers."""
-        form = self.objective.copy()
-        for weight, limit in zip(multipliers, self.limits, strict=True):
-            form += weight * limit.form
-        self.evaluations += 1
-        K, moments, value, error = lq_point(self.A, self.b, form, self.noise, self.ratios)
-        if not (error < LARGEST_RESIDUAL and np.isfinite(moments).all()):
-            raise RunError(f"the Riccati equation could not be solved (relative residual {error:.1e})")
-        spent = np.array([[np.sum(m * limit.form) for limit in self.limits] for m in moments])
-        cost = float(np.sum(moments[0] * self.objective))
-        return _Point(multipliers, form, K, moments, spent[0], spent.max(axis=0), cost, value)
-
-
-@dataclass(frozen=True)
-class _Point:
-    """Gain, moments and what the limits see: over the line's width, and at worst, the sines counted in."""
-
-    multipliers: Array
-    form: Array
-    K: Array
-    moments: Array
-    spent: Array
-    worst: Array
-    cost: float
-    value: float
-
-    @property
-    def gap(self) -> float:
-        """Relative duality gap, for the bounds that the worst case leaves to the mean over the line."""
-        allowed = np.where(self.worst > 0.0, self.spent / np.where(self.worst > 0.0, self.worst, 1.0), 1.0)
-        dual = self.value - float(self.multipliers @ allowed)
-        return abs(self.cost - dual) / self.cost if self.cost > 0.0 else 0.0
 
 
 class PowerBudgetedLQ:
@@ -238,7 +176,7 @@ class PowerBudgetedLQ:
         objective += np.outer(row, row) / (scaling.angular_frequency * DISPLACEMENT_SCALE_M) ** 2
         objective[-1, -1] = self.effort_floor
         drift = drift_hz / frequency_hz
-        problem = _Problem(
+        problem = BudgetProblem(
             A=A,
             b=b,
             noise=np.ascontiguousarray(excited.noise[-2:]) / math.sqrt(scaling.angular_frequency),
@@ -247,9 +185,9 @@ class PowerBudgetedLQ:
             ratios=np.array([1.0, 1.0 - drift, 1.0 + drift] if drift else [1.0]),
             steepness=self._steepness(excited, scaling),
         )
-        return self._design(excited, scaling, problem, self._solve(problem))
+        return self._design(excited, scaling, problem, self._solve(problem, excited, bounds))
 
-    def _limits(self, excited: ExcitedPlant, bounds: dict[str, float]) -> tuple[Scaling, tuple[_Limit, ...]]:
+    def _limits(self, excited: ExcitedPlant, bounds: dict[str, float]) -> tuple[Scaling, tuple[Limit, ...]]:
         coil = excited.coil
         k, ohm = coil.force_constant_n_a, coil.resistance_ohm
         thermal, peak = bounds["joule_mean_w"], bounds["current_peak_a"]
@@ -274,15 +212,15 @@ class PowerBudgetedLQ:
         if math.isfinite(power):
             heat = form(force, force) * ohm / k**2 / power
             if thermal <= 0.5 * ohm * peak**2:
-                limits.append(_Limit("power", heat, thermal, 1.0 / thermal))
+                limits.append(Limit("power", heat, thermal, 1.0 / thermal))
             else:
-                limits.append(_Limit("current", heat, peak, 2.0 / peak))
+                limits.append(Limit("current", heat, peak, 2.0 / peak))
         if math.isfinite(electrical := bounds["electrical_mean_w"]):
             drawn = form(force, force) * ohm / k**2 - form(force, np.append(excited.stroke_rate, 0.0))
-            limits.append(_Limit("electrical", drawn / electrical, electrical, 1.0 / electrical))
+            limits.append(Limit("electrical", drawn / electrical, electrical, 1.0 / electrical))
         if math.isfinite(stroke := bounds["stroke_m"]):
             travel = np.append(excited.stroke, 0.0)
-            limits.append(_Limit("stroke", form(travel, travel) * 2.0 / stroke**2, stroke, 2.0 / stroke))
+            limits.append(Limit("stroke", form(travel, travel) * 2.0 / stroke**2, stroke, 2.0 / stroke))
         return scaling, tuple(limits)
 
     @staticmethod
@@ -292,12 +230,12 @@ class PowerBudgetedLQ:
         per_newton = excited.phasors()[0] @ excited.velocity[:n] / excited.angular_frequency
         return float(per_newton * scaling.force_n / DISPLACEMENT_SCALE_M) ** 2
 
-    def _solve(self, problem: _Problem) -> _Point:
+    def _solve(self, problem: BudgetProblem, excited: ExcitedPlant, bounds: dict[str, float]) -> LQPoint:
         point = problem.at(np.zeros(len(problem.limits)))
         broken = np.nonzero(point.worst > 1.0)[0]
         # A design that meets every limit with the multiplier of one alone is optimal: try those first.
         for k in sorted(broken, key=lambda i: -point.worst[i]):
-            alone = _secant(problem, int(k), point, self.effort_floor)
+            alone = meet_one(problem, int(k), point, self.effort_floor)
             if alone is not None and np.all(alone.worst <= 1.0):
                 return alone
         if not len(broken):
@@ -307,10 +245,16 @@ class PowerBudgetedLQ:
             self._programs[size] = BudgetProgram(*size)
         noise = np.concatenate([np.zeros(len(problem.A) - 2), problem.noise])
         forms = [limit.form for limit in problem.limits]
-        start = self._programs[size].multipliers(problem.A, problem.b, noise, problem.objective, forms)
-        return _newton(problem, start)
+        try:
+            start = self._programs[size].multipliers(problem.A, problem.b, noise, problem.objective, forms)
+            # No solver status is trusted, neither a good nor a bad one: what counts is what the start leads to.
+            return meet_all(problem, np.ones(len(forms)) if start is None else start)
+        except RunError as error:
+            raise RunError(f"{error}{_stroke_needs(excited, bounds)}") from error
 
-    def _design(self, excited: ExcitedPlant, scaling: Scaling, problem: _Problem, point: _Point) -> LQDesign:
+    def _design(
+        self, excited: ExcitedPlant, scaling: Scaling, problem: BudgetProblem, point: LQPoint
+    ) -> LQDesign:
         stretch = np.append(scaling.scale, scaling.force_n)
         form = point.form / np.outer(stretch, stretch)
         moments = point.moments * np.outer(stretch, stretch)
@@ -351,74 +295,17 @@ class PowerBudgetedLQ:
         )
 
 
-def _secant(problem: _Problem, k: int, start: _Point, floor: float) -> _Point | None:
-    """Multiplier of one limit that just meets it, by a bracketed secant on logarithms; None if none does."""
-
-    def at(log_weight: float) -> tuple[_Point, float]:
-        weights = np.zeros(len(problem.limits))
-        weights[k] = math.exp(log_weight) - floor
-        point = problem.at(weights)
-        # The logarithm of what is spent is nearly straight in that of the weight; what is not positive has none.
-        return point, math.log(max(float(point.worst[k]), 1e-3)) + 0.5 * TIGHT
-
-    low, above = math.log(floor), math.log(float(start.worst[k]))
-    # With a narrow line |x1| falls in proportion to the force added; that gives the slope, so the multiplier.
-    high = math.log(floor + problem.steepness * max(math.sqrt(float(start.worst[k])) - 1.0, 1e-3))
-    high = max(high, low + 0.1)
-    point, level = at(high)
-    while level > 0.0:
-        low, above = high, level
-        high += 1.0
-        if high > math.log(LARGEST_MULTIPLIER):
-            return None
-        point, level = at(high)
-    best, below = point, level
-    older, newer = (low, above), (high, below)
-    for _ in range(80):
-        if best.worst[k] >= 1.0 - TIGHT:
-            break
-        slope = (newer[1] - older[1]) / (newer[0] - older[0]) if newer[0] != older[0] else 0.0
-        weight = newer[0] - newer[1] / slope if slope < 0.0 else low
-        if not low < weight < high:
-            weight = 0.5 * (low + high)
-            if weight in (low, high):
-                break
-        point, level = at(weight)
-        older, newer = newer, (weight, level)
-        if level > 0.5 * TIGHT:
-            low = weight
-        else:
-            high, best = weight, point
-    return best
-
-
-def _newton(problem: _Problem, start: Array) -> _Point:
-    """Multipliers that meet several limits at once: Newton's method on their logarithms, from a good start."""
-    weights = np.where(start > 1e-6 * start.max(), start, 0.0)
-    point = problem.at(weights)
-    for _ in range(40):
-        # Limits without a multiplier join when they are broken; others leave when theirs vanishes.
-        joining = (weights == 0.0) & (point.worst > 1.0 + TIGHT)
-        if joining.any():
-            weights = np.where(joining, 1e-3 * max(weights.max(), 1e-3), weights)
-            point = problem.at(weights)
-        active = np.nonzero(weights > 0.0)[0]
-        rest = point.worst[active] - 1.0 + 0.5 * TIGHT
-        if np.all(np.abs(rest) <= 0.5 * TIGHT) and np.all(point.worst <= 1.0):
-            return point
-        slopes = np.empty((len(active), len(active)))
-        for column, k in enumerate(active):
-            moved = weights.copy()
-            moved[k] *= 1.0 + 1e-5
-            slopes[:, column] = (problem.at(moved).worst[active] - point.worst[active]) / 1e-5
-        step = -np.linalg.lstsq(slopes, rest, rcond=1e-12)[0]
-        step *= min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-300))
-        for shorten in (1.0, 0.5, 0.25, 0.1, 0.02):
-            tried = weights.copy()
-            tried[active] *= np.exp(shorten * step)
-            tried[tried < 1e-9 * tried.max()] = 0.0
-            after = problem.at(tried)
-            if np.abs(after.worst[active] - 1.0).max() < np.abs(rest).max():
-                break
-        weights, point = tried, after
-    raise RunError("no control keeps all limits at once; allow more power or more stroke")
+def _stroke_needs(excited: ExcitedPlant, bounds: dict[str, float]) -> str:
+    """What the stroke limit alone takes of current and power, for the message that it cannot be kept."""
+    n = excited.own_states
+    inputs = np.column_stack([excited.b[:n], math.sqrt(2.0) * excited.A[:n, n + 1]])
+    resolvent = 1j * excited.angular_frequency * np.eye(n) - excited.A[:n, :n]
+    per_newton, alone = np.abs(excited.stroke[:n] @ np.linalg.solve(resolvent, inputs))
+    missing = alone - bounds["stroke_m"]
+    if not 0.0 < missing < math.inf:
+        return ""
+    amperes = float(missing / per_newton) / excited.coil.force_constant_n_a
+    return (
+        f": without control the stroke is {1e3 * alone:.3g} mm, and to hold it to {1e3 * bounds['stroke_m']:.3g} mm "
+        f"takes at least {amperes:.3g} A peak, {0.5 * excited.coil.resistance_ohm * amperes**2:.3g} W mean Joule"
+    )
