@@ -257,10 +257,42 @@ class RigModel:
             out[line + 1 :, line:-1] = np.eye(size - line - 1)
         return out
 
+    def stepping(self) -> DiscreteModel:
+        """The plant for stepping sample by sample, with the measured relative acceleration as its one output.
+
+        The coil's input u is the command given ``delay_samples + 1`` samples ago, whatever the delay's fraction.
+        """
+        B0, B1 = self.discrete.B0.copy(), self.discrete.B1.copy()
+        B0[:, self.coil_input], B1[:, self.coil_input] = self._early, self._late
+        return DiscreteModel(self.discrete.F, B0, B1, self._rows[2:3].copy(), self._feed[2:3].copy())
+
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of the closed loop [1/s]: the largest real part of its poles; below 0 is stable."""
         poles = np.abs(np.linalg.eigvals(self.closed_loop_matrix(gains)))
         return float(np.log(poles.max()) * self.facts.sample_rate_hz)
+
+    def slowest_poles(self, gains: Gains, count: int) -> tuple[Array, Array]:
+        """Real parts of the slowest closed-loop poles [1/s] and what the gains do to them.
+
+        Returns
+        -------
+        tuple of ndarray
+            (count,) real parts, the largest first, one of each pair; (count, 3) their slopes over alpha, beta, gamma.
+        """
+        n, fs, k = len(self._late), self.facts.sample_rate_hz, self.coil.force_constant_n_a
+        poles, right = np.linalg.eig(self.closed_loop_matrix(gains))
+        left = np.linalg.inv(right)
+        order = np.argsort(-np.abs(poles), kind="stable")
+        chosen = [int(j) for j in order if poles[j].imag >= 0.0][:count]
+        _, _, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, fs)
+        line = n + CHAIN_STATES
+        # The gains stand in the command alone: per unit, what each state adds to it, and where it goes.
+        commands = (D * self._rows[2] @ right[:n] + C @ right[n:line]) / k
+        enters = left[:, line] if len(poles) > line else np.zeros(len(poles), dtype=np.complex128)
+        if self.facts.delay_samples == 0:
+            enters = enters + left[:, :n] @ self._late
+        turns = enters[chosen, None] * commands.T[chosen] / poles[chosen, None]
+        return np.log(np.abs(poles[chosen])) * fs, np.asarray(turns.real * fs)
 
     @property
     def modes_hz(self) -> Array:

@@ -16,6 +16,7 @@ What is found here is a candidate. `tuning.transition` judges it by eigenvalues 
 import math
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -236,7 +237,7 @@ def one_function(samples: Samples, start: Array, weights: Array) -> Array | None
     return None if found is None else found[0]
 
 
-def _candidate(problem: cp.Problem, unknowns: list[tuple[Array, cp.Variable]]) -> Array | None:
+def _candidate(problem: cp.Problem, unknowns: list[tuple[Any, Any]]) -> Array | None:
     """Solve; whatever comes out is only a candidate, so that the solver's status does not matter."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "may be inaccurate": it is judged elsewhere

@@ -204,8 +204,8 @@ def _unstable_standing_still(loop: _Loop, kinks: Array) -> TransitionCertificate
         return None
     bad, worst = grid[growth >= -STILL_1_S], int(np.argmax(growth))
     reason = (
-        f"not stable even while the frequency stands still, from {bad.min():.4g} to {bad.max():.4g} Hz: the slowest pole "
-        f"is at {growth[worst]:+.3g} 1/s at {grid[worst]:.4g} Hz"
+        f"not stable even while the frequency stands still, from {bad.min():.4g} to {bad.max():.4g} Hz: the slowest "
+        f"pole is at {growth[worst]:+.3g} 1/s at {grid[worst]:.4g} Hz"
     )
     return _certificate(False, "none", 0.0, -float(growth[worst]), reason, np.zeros(0), np.zeros((0, 0, 0)))
 
@@ -244,8 +244,8 @@ def _switching_witness(loop: _Loop, kinks: Array) -> str:
             growth = math.log(float(np.abs(np.linalg.eigvals(turn)).max())) / (2 * count * loop.dt)
             if growth > best[0]:
                 text = (
-                    f"no one function can hold for the whole table, since jumping between {ends[a]:g} and {ends[b]:g} Hz "
-                    f"every {1e3 * count * loop.dt:.3g} ms makes the loop grow by {growth:.3g} 1/s"
+                    f"no one function can hold for the whole table, since jumping between {ends[a]:g} and {ends[b]:g} "
+                    f"Hz every {1e3 * count * loop.dt:.3g} ms makes the loop grow by {growth:.3g} 1/s"
                 )
                 best = (growth, text)
     return best[1]
