@@ -1,24 +1,337 @@
-"""Whether model and measurements agree, judged by the observer's own innovations."""
+"""Whether model and measurements agree, watched live by the observer's own innovations.
+
+Of a consistent filter the normalised innovations are white, of mean 0 and variance 1. Three statistics of every sensor
+say whether they are, over the newest block and over a memory that fades exponentially: the NIS against its chi-square
+band, the mean, and the autocorrelation from one sample to the next (`estimators.consistency`).
+
+With thousands of samples in a block the bands are so narrow that every model is outside of them. A verdict therefore
+asks whether a statistic is beyond what is tolerated by more than chance would carry it there, at a level so low that it
+does not happen within a day.
+"""
 
 import math
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-Health = Literal["agrees", "drifts", "disagrees", "no data"]
+import numpy as np
 
-# Mean NIS over a block is 1 for a consistent filter; these bounds leave room for its scatter over a block.
-AGREES, DRIFTS = (0.5, 2.0), (0.25, 4.0)
+from estimators.consistency import (
+    FadingStatistics,
+    Statistics,
+    bias_band,
+    nis_band,
+    nis_bands,
+    statistics_of,
+    whiteness_band,
+)
+from estimators.isolation import ALIKE, innovation_signatures, suspect_of_excess, suspect_of_offset
+from estimators.observer import Observer
+from estimators.signal_check import Finding
+from estimators.types import StateEstimate
+from twin.plant.blocks import Block, Channel
+
+Verdict = Literal["consistent", "drifting", "diverged", "no data"]
+HealthTest = Literal["", "signal", "bias", "noise", "nis", "whiteness"]
+
+BAND_LEVEL = 0.05
+"""Outside of the band that people see a consistent filter is this often."""
+
+VERDICT_LEVEL = 1e-7
+"""Beyond the tolerated by chance a statistic is at most this often; of 24 looks per block of 0.1 s, once in 12 h."""
 
 
-def model_health(nis: float) -> Health:
-    """Return a word for how well model and rig agree.
+@dataclass(frozen=True, slots=True)
+class HealthSettings:
+    """What is tolerated, and how long things are remembered.
+
+    Attributes
+    ----------
+    nis
+        Between these a sensor's NIS is consistent, chance aside.
+    nis_diverged
+        From here on the filter's covariance is no description of its error any more.
+    bias, bias_diverged
+        Likewise for the mean of the normalised innovations. An accelerometer's offset bends the estimate of
+        displacement by far more of its standard deviation than it shows here.
+    whiteness
+        Tolerated autocorrelation from sample to sample; colour alone never makes a filter diverged.
+    memory_s
+        Time constant of the fading memory [s].
+    hold_s
+        A masked signal is held against its channel this long after it was last seen [s].
+    spikes
+        Fewer spikes than these within ``hold_s`` are masked without a word.
+    """
+
+    nis: tuple[float, float] = (0.6, 1.25)
+    nis_diverged: float = 1.75
+    bias: float = 0.02
+    bias_diverged: float = 0.5
+    whiteness: float = 0.1
+    memory_s: float = 1.0
+    hold_s: float = 0.5
+    spikes: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Verdict over one block, in words a person can act on.
+
+    Attributes
+    ----------
+    verdict
+        ``consistent``, ``drifting`` (the estimate suffers), ``diverged`` (it must not be relied on) or ``no data``.
+    channel
+        Who says so; empty while consistent.
+    test
+        Which test says so: ``signal`` (masked samples), ``bias``, ``noise``, ``nis`` or ``whiteness``.
+    reason
+        The finding with channel, size and likely cause; empty while consistent.
+    nis, nis_band
+        Mean NIS over the block's scalar measurements, and where 95 % of a consistent filter's are; NaN without any.
+    bias, whiteness
+        Mean and autocorrelation of the normalised innovations of ``channel``, or of the sensor nearest to the edge;
+        NaN without any.
+    since_sample
+        First sample of the block with which the verdict began.
+    """
+
+    verdict: Verdict
+    channel: str
+    test: HealthTest
+    reason: str
+    nis: float
+    nis_band: tuple[float, float]
+    bias: float
+    whiteness: float
+    since_sample: int
+
+
+class _Cause(NamedTuple):
+    severity: int
+    channel: str
+    test: HealthTest
+    reason: str
+
+
+class _Masked(NamedTuple):
+    cause: _Cause
+    until_sample: int
+
+
+_CONSISTENT = _Cause(0, "", "", "")
+_VERDICTS: tuple[Verdict, ...] = ("consistent", "drifting", "no data", "diverged")
+_DRIFTING, _NO_DATA, _DIVERGED = 1, 2, 3
+_CAPS = (
+    4.0,
+    0.75,
+    1.0,
+)  # what one block can add to the memory: a fault is forgotten within three time constants
+
+
+class HealthMonitor:
+    """Watch one observer's consistency block by block.
 
     Parameters
     ----------
-    nis
-        Mean normalised innovation squared per measurement over a block; NaN if nothing was measured.
+    channels
+        The blocks' columns, for the units in what is said.
+    settings
+        See `HealthSettings`.
     """
-    if not math.isfinite(nis):
-        return "no data"
-    if AGREES[0] <= nis <= AGREES[1]:
-        return "agrees"
-    return "drifts" if DRIFTS[0] <= nis <= DRIFTS[1] else "disagrees"
+
+    def __init__(self, channels: Sequence[Channel], settings: HealthSettings | None = None) -> None:
+        self.settings = settings or HealthSettings()
+        self._units = {c.name: c.unit for c in channels}
+        self._memory: FadingStatistics | None = None
+        self._masked: dict[str, _Masked] = {}
+        self._spikes: dict[str, float] = {}
+        self._verdict: Verdict = "consistent"
+        self._since = 0
+        self._cause = _CONSISTENT
+
+    def advance(
+        self,
+        block: Block,
+        estimate: StateEstimate,
+        findings: Sequence[Finding],
+        observer: Observer,
+        frequency_hz: float,
+    ) -> Health:
+        """Judge one block.
+
+        Parameters
+        ----------
+        estimate
+            The observer's over the block.
+        findings
+            What was masked in it.
+        observer
+            Asked how errors of its sensors spread, when there is one to name.
+        frequency_hz
+            Of the excitation, where a sensor's wrong gain shows.
+        """
+        elapsed_s = block.n_samples / block.sample_rate_hz
+        signal = self._judge_signals(block, estimate, findings, elapsed_s)
+        now = statistics_of(estimate)
+        if self._memory is None:
+            self._memory = FadingStatistics(len(estimate.sensors))
+        self._memory.add(now, math.exp(-elapsed_s / self.settings.memory_s))
+        fading = self._memory.statistics()
+        severity = max(self._severity(now), self._severity(fading))
+        cause = _CONSISTENT
+        if severity:
+            statistics = now if self._severity(now) else fading
+            # While only the memory still knows of it, what was said first stands.
+            known = statistics is fading and self._cause.test not in ("", "signal")
+            cause = self._cause if known else self._name(statistics, estimate, observer, frequency_hz)
+            cause = cause._replace(severity=severity)
+        # A masked signal explains what the innovations show besides; the worse of both decides how bad it is.
+        if signal.severity:
+            cause = signal._replace(severity=max(signal.severity, min(severity, _DIVERGED)))
+        verdict = _VERDICTS[cause.severity]
+        if verdict != self._verdict:
+            self._verdict, self._since = verdict, block.first_sample
+        self._cause = cause
+        return self._health(estimate, now, cause)
+
+    def _health(self, estimate: StateEstimate, now: Statistics, cause: _Cause) -> Health:
+        seen = now.squares > 0.0
+        bias = whiteness = math.nan
+        if seen.any():
+            if cause.channel in estimate.sensors:
+                worst = estimate.sensors.index(cause.channel)
+            else:
+                worst = int(np.nanargmax(np.abs(np.where(seen, now.bias, np.nan) * np.sqrt(now.means))))
+            bias, whiteness = float(now.bias[worst]), float(now.lag1[worst])
+        return Health(
+            verdict=_VERDICTS[cause.severity],
+            channel=cause.channel,
+            test=cause.test,
+            reason=cause.reason,
+            nis=estimate.nis,
+            nis_band=nis_band(float(now.squares.sum()), BAND_LEVEL),
+            bias=bias,
+            whiteness=whiteness,
+            since_sample=self._since,
+        )
+
+    def _severity(self, s: Statistics) -> int:
+        """0 to 3 by the worst statistic of any sensor."""
+        settings = self.settings
+        low, high = nis_bands(s.squares, VERDICT_LEVEL)
+        off = bias_band(s.means, VERDICT_LEVEL)
+        with np.errstate(invalid="ignore"):  # NaN, of a sensor that said nothing, is beyond no bound
+            if (s.nis > settings.nis_diverged * high).any() or (
+                np.abs(s.bias) > settings.bias_diverged + off
+            ).any():
+                return _DIVERGED
+            coloured = np.abs(s.lag1) > settings.whiteness + whiteness_band(s.pairs, VERDICT_LEVEL)
+            outside = (s.nis > settings.nis[1] * high) | (s.nis < settings.nis[0] * low) | coloured
+            return _DRIFTING if (outside | (np.abs(s.bias) > settings.bias + off)).any() else 0
+
+    def _name(
+        self, s: Statistics, estimate: StateEstimate, observer: Observer, frequency_hz: float
+    ) -> _Cause:
+        """Find the test and the channel that says most, and put it in words."""
+        settings, names = self.settings, estimate.sensors
+        mean, nis = np.nan_to_num(s.bias), np.where(np.isfinite(s.nis), s.nis, 1.0)
+        lag1 = np.nan_to_num(s.lag1)
+        excess = nis - 1.0 - mean**2
+        low, high = nis_bands(s.squares, VERDICT_LEVEL)
+        off = bias_band(s.means, VERDICT_LEVEL)
+        beyond_bias = np.nan_to_num((np.abs(mean) - settings.bias) / off)
+        over = nis > settings.nis[1] * high
+        if beyond_bias.max() > 1.0 and (
+            not over.any() or (mean**2).sum() > 0.5 * np.maximum(excess, 0.0).sum()
+        ):
+            found = suspect_of_offset(mean, innovation_signatures(observer, 0.0))
+            worst = int(np.argmax(beyond_bias))
+            if found.likeness >= ALIKE:
+                std = math.sqrt(float(np.asarray(observer.filter.R)[found.sensor, found.sensor]))
+                name = names[found.sensor]
+                size = f"{found.error * std:+.2g} {self._units.get(name, '')}"
+                text = f"{name} has an offset of about {size}: check its zero, its supply and its mounting"
+                return _Cause(0, name, "bias", text)
+            text = (
+                f"{names[worst]} is off its prediction by {mean[worst]:+.2g} standard deviations on average"
+            )
+            return _Cause(0, names[worst], "bias", f"{text}: an offset, or a steady force the model lacks")
+        if over.any():
+            worst = int(np.argmax(nis / high))
+            if abs(lag1[worst]) < 0.25 and nis[worst] - 1.0 > 2.0 * np.sum(
+                np.delete(np.maximum(excess, 0.0), worst)
+            ):
+                text = f"{names[worst]} is noisier than stated by a factor of {math.sqrt(nis[worst]):.2g}"
+                return _Cause(
+                    0, names[worst], "noise", f"{text}: check cable and connector, or its noise_density"
+                )
+            found = suspect_of_excess(excess, innovation_signatures(observer, frequency_hz))
+            if found.likeness >= ALIKE:
+                name = names[found.sensor]
+                text = f"model and {name} disagree at the excitation (NIS {nis[found.sensor]:.3g})"
+                return _Cause(
+                    0,
+                    name,
+                    "nis",
+                    f"{text}: check its gain and alignment, then the model of what it measures",
+                )
+            text = f"the model disagrees with the rig, most in {names[worst]} (NIS {nis[worst]:.3g})"
+            return _Cause(0, names[worst], "nis", f"{text}: check masses, stiffnesses and coil constants")
+        colour = np.abs(lag1) - settings.whiteness
+        under = nis < settings.nis[0] * low
+        worst = int(np.argmin(np.where(under, nis / low, np.inf) if under.any() else -colour))
+        if under.any():
+            text = f"{names[worst]} is quieter than stated (NIS {nis[worst]:.2g})"
+            return _Cause(0, names[worst], "noise", f"{text}: its noise_density is too large, or it is dead")
+        text = f"innovations of {names[worst]} are coloured (lag-1 autocorrelation {lag1[worst]:+.2f})"
+        return _Cause(0, names[worst], "whiteness", f"{text}: dynamics the model lacks, or filtered noise")
+
+    def _judge_signals(
+        self, block: Block, estimate: StateEstimate, findings: Sequence[Finding], elapsed_s: float
+    ) -> _Cause:
+        """Hold what was masked against its channel for a while; return the worst that stands."""
+        settings = self.settings
+        until = block.end_sample + round(settings.hold_s * block.sample_rate_hz)
+        fade = math.exp(-elapsed_s / settings.hold_s)
+        self._spikes = {name: count * fade for name, count in self._spikes.items() if count > 0.1}
+        for finding in findings:
+            if finding.kind == "spiking":
+                self._spikes[finding.channel] = self._spikes.get(finding.channel, 0.0) + finding.samples
+                if self._spikes[finding.channel] < settings.spikes:
+                    continue
+            cause = _cause_of(finding)
+            if (
+                cause.channel not in self._masked
+                or cause.severity >= self._masked[cause.channel].cause.severity
+            ):
+                self._masked[cause.channel] = _Masked(cause, until)
+        self._masked = {n: m for n, m in self._masked.items() if m.until_sample > block.first_sample}
+        lost = float(estimate.innovation_count.sum()) == 0.0
+        if lost and block.n_samples:
+            names = [n for n in estimate.sensors if n in self._masked]
+            text = "no valid sample of any sensor in the block: check the connection to the rig"
+            return _Cause(_NO_DATA, ", ".join(names or estimate.sensors), "signal", text)
+        causes = [m.cause for m in self._masked.values()]
+        return max(causes, key=lambda c: c.severity) if causes else _CONSISTENT
+
+
+def _cause_of(finding: Finding) -> _Cause:
+    """Say what a masked signal means."""
+    name, at = finding.channel, f"{finding.value:.4g} {finding.unit}"
+    much = finding.share >= 0.5
+    match finding.kind:
+        case "missing":
+            text = f"{name} sends no valid samples: check its connection"
+            return _Cause(_NO_DATA if much else _DRIFTING, name, "signal", text)
+        case "stuck":
+            dead = "dead, it shows 0" if finding.value == 0.0 else f"stuck at {at}"
+            text = f"{name} is {dead} where its noise should move it: check sensor, cable and supply"
+            return _Cause(_DIVERGED if much else _DRIFTING, name, "signal", text)
+        case "saturated":
+            text = f"{name} is at the end of its range ({at}): reduce the excitation or its amplification"
+            return _Cause(_DIVERGED if much else _DRIFTING, name, "signal", text)
+        case "spiking":
+            text = f"{name} has spikes, up to {at}: check cable, connector and shielding"
+            return _Cause(_DRIFTING, name, "signal", text)

@@ -174,6 +174,16 @@ class SignalCheck:
             values.flags.writeable = False
         return CheckedBlock(replace(block, values=values, valid=valid), tuple(findings))
 
+    def warm_up(self, block: Block) -> None:
+        """Compile what a block needs, on copies; to be called before the first block."""
+        values = np.array(block.values)
+        kinds = np.zeros(values.shape, dtype=np.uint8)
+        scan(values, self._tail[2:], self._range, self._std, self._std, self._noisy, self._steps.copy())
+        mark_missing(values, np.array(block.valid), self._range, kinds)
+        mark_runs(values[:, 0], 10, self._run_length[0], self._tail[3, 0], kinds[:, 0])
+        mark_spikes(values[:, 0], self._tail[:, 0], 1.0, kinds[:, 0])
+        trailing_runs(values, self._run_length, np.zeros(values.shape[1], dtype=np.int64))
+
     def _know_roughness(self, values: Array, came: NDArray[np.bool_]) -> None:
         """Roughness of a channel at its first block: the median, which spikes do not move."""
         for c in np.flatnonzero(self._spikes & ~np.isfinite(self._roughness)):

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from estimators.health import Health
+from estimators.signal_check import CheckedBlock
 from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.types import Powers
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
@@ -137,8 +139,20 @@ def frames(plant: Plant, duration_s: float, *, block: int = BLOCK, seed: int = 1
         powers = Powers(2.7 * current**2 / 2, 2.7 * current**2, 2.9 * current**2 / 2)
         yield Frame(
             block=data,
+            checked=CheckedBlock(data, ()),
             twin=read_only(shapes),
             estimate=estimate,
+            health=Health(
+                verdict="consistent" if nis < 2.0 else "diverged",
+                channel="" if nis < 2.0 else names[1],
+                test="" if nis < 2.0 else "nis",
+                reason="" if nis < 2.0 else f"the model disagrees with the rig, most in {names[1]}",
+                nis=float(nis),
+                nis_band=(0.97, 1.03),
+                bias=0.0,
+                whiteness=0.0,
+                since_sample=data.first_sample,
+            ),
             phasors=Phasors(
                 frequency_hz=float(hz + 2e-3 * rng.standard_normal()),
                 frequency_std_hz=4e-3,

@@ -40,6 +40,8 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     health = rrb.Tabs(
         _trend("health/nis", "Model health: NIS, 1 = consistent", trend),
         _trend("health/innovation", "Innovations", trend),
+        _trend("health/bias", "Bias of innovations", trend),
+        _trend("health/whiteness", "Whiteness of innovations", trend),
         active_tab=0,
         name="Model health",
     )

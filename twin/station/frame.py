@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from estimators.health import Health
+from estimators.signal_check import CheckedBlock
 from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.types import Powers, Proposal
 from twin.control.schedule import Acknowledgement, Command
@@ -58,11 +60,15 @@ class Frame:
 
     Attributes
     ----------
+    block, checked
+        As it came, and as the estimators took it: with what cannot be trusted masked.
     twin
         (n_samples, n_sensors) outputs of the plant in parallel, stepped from the measured inputs alone, in
         the order of ``estimate.sensors``.
     estimate
         The observer's.
+    health
+        Whether model and rig agree, and who says that they do not.
     asked, arrival
         Number of the question asked of the tuner after this block, and what was taken of it at this block.
     phasors, curve, performance
@@ -70,8 +76,10 @@ class Frame:
     """
 
     block: Block
+    checked: CheckedBlock
     twin: Array
     estimate: StateEstimate
+    health: Health
     phasors: Phasors | None
     curve: DampingCurve | None
     performance: Performance | None

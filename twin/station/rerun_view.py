@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import rerun as rr
 
-from estimators.health import model_health
 from estimators.types import StateEstimate
 from twin.control.schedule import Command, GainSchedule
 from twin.plant.blocks import Channel
@@ -157,7 +156,11 @@ class RerunView:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate.innovation_rms / estimate.innovation_std
         self._columns.add("health/innovation", end, ratio[None, :])
-        self._columns.add("health/nis", end, np.array([[estimate.nis, 1.0]]))
+        self._columns.add("health/nis", end, np.array([[estimate.nis, *frame.health.nis_band]]))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            bias = estimate.innovation_mean / estimate.innovation_std
+        self._columns.add("health/bias", end, bias[None, :])
+        self._columns.add("health/whiteness", end, estimate.innovation_lag1[None, :])
 
     def _show_performance(self, frame: Frame, end: Array) -> None:
         if frame.phasors is not None:
@@ -210,7 +213,7 @@ class RerunView:
         now = {
             "control": "unknown" if on is None else "on" if on else "off",
             "damping": "none" if frame.curve is None else frame.curve.status,
-            "model": model_health(frame.estimate.nis),
+            "model": frame.health.verdict,
         }
         for lane, state in now.items():
             if self._lanes.get(lane) != state:
@@ -284,7 +287,16 @@ class RerunView:
             colours,
             [1.0] * len(sensors),
         )
-        _lines(stream, "health/nis", ["NIS [1]", "consistent"], [palette.IN_USE, palette.GOOD], [2.5, 1.5])
+        for path, what in (("health/bias", "mean/std"), ("health/whiteness", "lag-1 autocorrelation")):
+            names = [f"{s} {what} [1]" for s in sensors]
+            _lines(stream, path, names, colours, [1.0] * len(sensors))
+        _lines(
+            stream,
+            "health/nis",
+            ["NIS [1]", "95 % from", "95 % to"],
+            [palette.IN_USE, palette.GOOD, palette.GOOD],
+            [2.5, 1.5, 1.5],
+        )
         _lines(stream, "damping/in_use", ["c2 in use [Ns/m]"], [palette.IN_USE], [2.0])
         _band(stream, "damping/learned", "c2 learned ±1σ", "Ns/m", palette.LEARNED)
         _band(stream, "excitation", "excitation ±1σ", "Hz", palette.TWIN)
@@ -312,9 +324,9 @@ class RerunView:
             stream,
             "model",
             {
-                "agrees": palette.GOOD,
-                "drifts": palette.WARNING,
-                "disagrees": palette.POOR,
+                "consistent": palette.GOOD,
+                "drifting": palette.WARNING,
+                "diverged": palette.POOR,
                 "no data": palette.OFF,
             },
         )

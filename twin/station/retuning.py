@@ -146,6 +146,7 @@ class Retuning:
         curve: DampingCurve | None,
         plant: Plant,
         learner: DampingLearner,
+        doubt: str = "",
     ) -> Turn:
         """Take an answer if one has come, decide about it, and ask the next question if it is time.
 
@@ -157,10 +158,12 @@ class Retuning:
             How far the excitation moved over this block [Hz].
         plant
             The plant as identified.
+        doubt
+            Why the model must not be relied on at present; nothing is proposed then.
         """
         last = block.end_sample - 1
         arrival = self.tuner.take(last)
-        done = Turn() if arrival is None else self._decide(block, arrival, plant)
+        done = Turn() if arrival is None else self._decide(block, arrival, plant, doubt)
         self._since_question += 1
         asked = None
         if (
@@ -172,7 +175,9 @@ class Retuning:
         ):
             f, ahead = phasors.frequency_hz, self._look_ahead(moved_hz)
             std = learner.std_at(f)
-            propose = curve.status != "unestimated" and self._is_near(f, ahead) and self._is_wanted()
+            propose = (
+                not doubt and curve.status != "unestimated" and self._is_near(f, ahead) and self._is_wanted()
+            )
             self._open = self._question(last, plant, std, f, amplitude, ahead, propose=propose)
             self.tuner.ask(self._open)
             asked = self._next_question
@@ -209,7 +214,7 @@ class Retuning:
             promised_by=self._promised_by,
         )
 
-    def _decide(self, block: Block, arrival: Arrival, plant: Plant) -> Turn:
+    def _decide(self, block: Block, arrival: Arrival, plant: Plant, doubt: str) -> Turn:
         last = block.end_sample - 1
         question, self._open = self._open, None
         answer = arrival.answer
@@ -226,7 +231,8 @@ class Retuning:
             return Turn(events=tuple(events))
         if proposal.reason:
             events.append(Event(last, "warning", f"retuning: {proposal.reason}"))
-        verdict = proposal.reason if not proposal.feasible else self._outdated(question, proposal, plant)
+        infeasible = "" if proposal.feasible else proposal.reason
+        verdict = doubt or infeasible or self._outdated(question, proposal, plant)
         steps: dict[int, Gains] = {}
         if not verdict:
             steps = {row: gains for row, gains in answer.steps if self._is_worth_it(row, gains)}

@@ -1,6 +1,7 @@
 """The only loop: one block in, one frame out, the same for a live rig, a recording and a what-if.
 
-    block -> plant in parallel -> observer -> excitation -> damping -> retune -> frame (and perhaps a command)
+    block -> signal check -> plant in parallel -> observer -> health -> excitation -> damping -> retune
+          -> frame (and perhaps a command)
 
 A session owns no clock, no socket and no file. What it decides depends on the blocks and commands it is given and
 on nothing else, so that a replay repeats it.
@@ -8,14 +9,15 @@ on nothing else, so that a replay repeats it.
 
 import math
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from estimators.damping import AbsorberBalance, DampingLearner, LearnerSettings
+from estimators.damping import AbsorberBalance, DampingLearner, ForceBalance, LearnerSettings
 from estimators.excitation import ExcitationTracker, choose_reference
-from estimators.health import model_health
+from estimators.health import Health, HealthMonitor
 from estimators.observer import Observer
+from estimators.signal_check import Finding, SignalCheck
 from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.loop import LoopFacts
 from tuning.retune import TuningGoal
@@ -32,6 +34,15 @@ from twin.station.worker import AfterBlocks, Tuner, TunerHere
 
 SETTLE_BLOCKS = 3
 """Blocks not learned from after the controller went on or off."""
+
+UNKNOWN_NS_M = 1.0
+"""Where the damping is less well known than this, an inconsistent model is no reason not to learn it."""
+
+REPRIEVE_S = 3.0
+"""A model that disagrees this long while the absorber's own force balance closes may be cured by learning."""
+
+STIFFNESS_SHARE = 0.005
+"""The force balance closes if the stiffness it gives has moved by no more than this share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +129,12 @@ class Session:
         self._blocks = 0
         self._control_on: bool | None = None
         self._since_switch = SETTLE_BLOCKS
-        self._status = self._health = ""
+        self._status = ""
+        self._health: Health | None = None
+        self._masked: tuple[str, ...] = ()
+        used = {*self.observer.sensors, *(source.channel for source in sources if source.channel is not None)}
+        self._check = SignalCheck(plant, names, sample_rate_hz, used)
+        self._monitor = HealthMonitor(channels)
 
     def _start_learning(
         self, names: tuple[str, ...], recorded: dict[int, Command] | None, tuner: Tuner | None
@@ -158,7 +174,9 @@ class Session:
         valid[0] = False  # both kernels of the observer
         for mask in (valid, np.ones_like(valid)):
             twin.observer.advance(Block(0, twin.observer.sample_rate_hz, values, mask, self.channels))
-        twin._parallel.advance(Block(0, twin.observer.sample_rate_hz, values, valid, self.channels))
+        block = Block(0, twin.observer.sample_rate_hz, values, np.ones_like(valid), self.channels)
+        twin._parallel.advance(block)
+        twin._check.warm_up(block)
         if twin._learner is not None:
             twin._learner.warm_up()
         if self.retuning is not None:
@@ -173,24 +191,29 @@ class Session:
             What the rig has answered since the last block, for the frame.
         """
         events = self._note_changes(block, acknowledgements)
+        raw, checked = block, self._check.advance(block)
+        block = checked.block
+        self._note_masked(block, checked.findings, events)
         self._refresh_model()
         twin = self._parallel.advance(block)[:, self._parallel_rows]
         estimate = self.observer.advance(block)
-        self._note_health(block, estimate, events)
+        health = self._note_health(block, estimate, checked.findings, events)
         phasors = self._tracker.advance(block) if self._tracker is not None else None
         moved = 0.0
         if phasors is not None:
             moved = phasors.frequency_hz - self._frequency if self._blocks else 0.0
             self._frequency = phasors.frequency_hz
-        curve = self._learn(block, phasors, events)
-        turn = self._retune(block, phasors, moved, curve)
+        curve = self._learn(block, phasors, checked.findings, health, events)
+        turn = self._retune(block, phasors, moved, curve, health)
         events.extend(turn.events)
         performance = self._performance(block, phasors, estimate)
         self._blocks += 1
         return Frame(
-            block=block,
+            block=raw,
+            checked=checked,
             twin=twin,
             estimate=estimate,
+            health=health,
             phasors=phasors,
             curve=curve,
             performance=performance,
@@ -219,39 +242,72 @@ class Session:
                 events.append(Event(first, "info", f"control {'on' if block.control_on else 'off'}"))
                 self._since_switch = 0
             self._control_on = block.control_on
-        masked = block.valid.size - int(block.valid.sum())
-        if masked:
-            names = [c.name for i, c in enumerate(self.channels) if not block.valid[:, i].all()]
-            events.append(Event(first, "warning", f"{masked} samples masked in {', '.join(names)}"))
         return events
 
-    def _note_health(self, block: Block, estimate: StateEstimate, events: list[Event]) -> None:
-        health = model_health(estimate.nis)
-        if health == self._health:
-            return
-        if self._health or health != "agrees":
-            level: Literal["info", "warning"] = "info" if health == "agrees" else "warning"
-            ratio = estimate.innovation_rms / estimate.innovation_std
-            worst = estimate.sensors[int(np.nanargmax(ratio))] if np.isfinite(ratio).any() else "no sensor"
-            text = f"model {health} with the rig (NIS {estimate.nis:.2f}, most in {worst})"
-            events.append(Event(block.end_sample - 1, level, text if health != "no data" else "no data"))
-        self._health = health
+    def _note_masked(self, block: Block, findings: tuple[Finding, ...], events: list[Event]) -> None:
+        masked = tuple(f"{f.channel} ({f.kind})" for f in findings)
+        if masked and masked != self._masked:
+            count = sum(f.samples for f in findings)
+            events.append(
+                Event(block.first_sample, "warning", f"{count} samples masked in {', '.join(masked)}")
+            )
+        self._masked = masked
 
-    def _learn(self, block: Block, phasors: Phasors | None, events: list[Event]) -> DampingCurve | None:
+    def _note_health(
+        self, block: Block, estimate: StateEstimate, findings: tuple[Finding, ...], events: list[Event]
+    ) -> Health:
+        health = self._monitor.advance(block, estimate, findings, self.observer, self._frequency)
+        before, self._health = self._health, health
+        same = before is not None and (before.verdict, before.channel) == (health.verdict, health.channel)
+        if not same and (before is not None or health.verdict != "consistent"):
+            sample = block.end_sample - 1
+            if health.verdict == "consistent":
+                events.append(Event(sample, "info", "model consistent with the rig"))
+            else:
+                what = {"no data": "no data"}.get(health.verdict, f"model {health.verdict}")
+                events.append(Event(sample, "warning", f"{what}: {health.reason}"))
+        return health
+
+    def _learn(
+        self,
+        block: Block,
+        phasors: Phasors | None,
+        findings: tuple[Finding, ...],
+        health: Health,
+        events: list[Event],
+    ) -> DampingCurve | None:
         if self._learner is None or self._balance is None:
             return None
         balance = self._balance.solve(phasors) if phasors is not None else None
         objection = ""
         if self._since_switch < SETTLE_BLOCKS:
             objection = "control has just been switched"
-        elif not block.valid.all():
-            objection = "missing or saturated samples"
+        elif findings:
+            names = dict.fromkeys(f"{f.channel} ({f.kind})" for f in findings)
+            objection = f"samples masked in {', '.join(names)}"
+        elif health.verdict != "consistent":
+            objection = self._distrust(block, health, balance)
         curve = self._learner.advance(balance, block.n_samples / block.sample_rate_hz, objection)
         status = curve.status + (f": {curve.reason}" if curve.reason else "")
         if status != self._status:
             events.append(Event(block.first_sample, "info", f"damping {status}"))
             self._status = status
         return curve
+
+    def _distrust(self, block: Block, health: Health, balance: ForceBalance | None) -> str:
+        """Why an inconsistent model speaks against learning; empty where learning may be the cure."""
+        learner, absorber = self._learner, self.plant.absorber
+        if learner is None or absorber is None or health.test in ("signal", "noise", "bias"):
+            return health.reason
+        if learner.std_at(self._frequency) > UNKNOWN_NS_M:
+            return ""
+        known = learner.curve().stiffness_n_m
+        known = known if math.isfinite(known) else absorber.stiffness_n_m
+        closes = balance is not None and abs(balance.stiffness_n_m - known) <= (
+            STIFFNESS_SHARE * known + 5.0 * balance.stiffness_std_n_m
+        )
+        lasts_s = (block.end_sample - health.since_sample) / block.sample_rate_hz
+        return "" if closes and lasts_s > REPRIEVE_S else health.reason
 
     def _damping_now(self) -> float:
         if self._learner is None:
@@ -277,7 +333,12 @@ class Session:
         self._parallel.set_model(discrete)
 
     def _retune(
-        self, block: Block, phasors: Phasors | None, moved_hz: float, curve: DampingCurve | None
+        self,
+        block: Block,
+        phasors: Phasors | None,
+        moved_hz: float,
+        curve: DampingCurve | None,
+        health: Health,
     ) -> Turn:
         if self.retuning is None or self._learner is None:
             return Turn()
@@ -285,7 +346,14 @@ class Session:
         if phasors is not None:
             amplitude = abs(phasors.amplitude[self._names.index(phasors.reference)])
         return self.retuning.turn(
-            block, phasors, amplitude, moved_hz, curve, self._plant_now(), self._learner
+            block,
+            phasors,
+            amplitude,
+            moved_hz,
+            curve,
+            self._plant_now(),
+            self._learner,
+            doubt=health.reason if health.verdict == "diverged" else "",
         )
 
     def _performance(

@@ -42,7 +42,8 @@ class RunLog:
         block = frame.block
         self.blocks += 1
         self.samples += block.n_samples
-        self.masked += block.valid.size - int(block.valid.sum())
+        valid = frame.checked.block.valid
+        self.masked += valid.size - int(valid.sum())
         self.commands += frame.command is not None
         self.curve = frame.curve or self.curve
         self._on_for_s = self._on_for_s + block.n_samples / block.sample_rate_hz if block.control_on else 0.0
