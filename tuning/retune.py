@@ -106,6 +106,8 @@ class Retuner:
         Sampling and delay of the rig's loop.
     goal
         Budget and margin.
+    limit
+        Compiled limit problem of another tuner in the same thread, to share; a new one takes a while to set up.
 
     Raises
     ------
@@ -113,7 +115,9 @@ class Retuner:
         If the plant states no limit on the coil's current or stroke: without them nothing may be proposed.
     """
 
-    def __init__(self, plant: Plant, facts: LoopFacts, goal: TuningGoal) -> None:
+    def __init__(
+        self, plant: Plant, facts: LoopFacts, goal: TuningGoal, limit: LimitProblem | None = None
+    ) -> None:
         coil, absorber = plant.voice_coil, plant.absorber
         if coil is None or absorber is None:
             raise InputError(
@@ -132,7 +136,7 @@ class Retuner:
         self._coil = coil
         power = min(goal.joule_mean_w, plant.limits.get(f"{coil.name}_power_w", math.inf))
         self._limits = CoilLimits(power, plant.limits[current], plant.limits["stroke_m"], coil.resistance_ohm)
-        self._limit = LimitProblem()
+        self._limit = limit or LimitProblem()
         modes = natural_frequencies_hz(plant)
         self._check_grid = margin_grid(facts.sample_rate_hz, modes, 200)
         self._design_rows = slice(None, None, 4)
