@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
-from twin.plant.stretches import STRETCH, add_product, recursion
 
 STATISTICS = 9
 COUNT, SUM, SQUARES, VARIANCES, NIS, NORMALISED, LAGGED, PAIRS, PREDICTION = range(STATISTICS)
@@ -137,119 +136,34 @@ def full_covariance_block(
 
 
 @kernel
-def constant_gain_block(
-    F: Array,
-    B0: Array,
-    B1: Array,
-    H: Array,
-    D: Array,
-    gain: Array,
-    root: Array,
-    whitening: Array,
-    x: Array,
-    u_before: Array,
-    u: Array,
-    z: Array,
-    last: Array,
-    mean: Array,
-    statistics: Array,
-) -> None:
-    """Kalman filter with a constant gain, in place; every sample must be valid.
-
-    With e the innovation and v the inputs before and now, ``e = z - G v - H F x`` and
-    ``x <- (F - K H F) x + W (v, z)``: all but the recursion in x has no memory, and is worked out for many
-    samples at once, signals in rows and time along them.
+def summarise(sums: Array, out: Array) -> None:
+    """Means of the statistics per sensor.
 
     Parameters
     ----------
-    gain
-        (n, p) steady gain.
-    root, whitening
-        (p, p) lower triangular root of the steady innovation covariance, and its inverse: the normalised sequential
-        innovations are ``whitening @ e``, since a Cholesky factor explains each sensor by those before it.
-
-    Others as `full_covariance_block`.
+    sums
+        (STATISTICS, p) what the observer's kernels added up.
+    out
+        (7, p) receives count, mean, root mean square and expected standard deviation of the innovations, their
+        autocorrelation from one sample to the next, mean NIS, and root mean square of the prediction error; NaN
+        where nothing was measured.
     """
-    n, m, p, n_samples = F.shape[0], u.shape[1], H.shape[0], z.shape[0]
-    innovation_of_x, innovation_of_inputs = np.zeros((p, n)), np.zeros((p, 2 * m))
-    for r in range(p):
-        for i in range(n):
-            for j in range(n):
-                innovation_of_x[r, j] -= H[r, i] * F[i, j]
-            for j in range(m):
-                innovation_of_inputs[r, j] -= H[r, i] * B0[i, j]
-                innovation_of_inputs[r, m + j] -= H[r, i] * B1[i, j]
-        for j in range(m):
-            innovation_of_inputs[r, m + j] -= D[r, j]
-    columns, drift_of_signals = F.T.copy(), np.zeros((n, 2 * m + p))
-    for i in range(n):
-        for j in range(m):
-            drift_of_signals[i, j], drift_of_signals[i, m + j] = B0[i, j], B1[i, j]
-        for r in range(p):
-            for j in range(n):
-                columns[j, i] += gain[i, r] * innovation_of_x[r, j]
-            for j in range(2 * m):
-                drift_of_signals[i, j] += gain[i, r] * innovation_of_inputs[r, j]
-            drift_of_signals[i, 2 * m + r] = gain[i, r]
-    normalised_of_x, normalised_of_signals = np.zeros((p, n)), np.zeros((p, 2 * m + p))
-    for r in range(p):
-        for q in range(r + 1):
-            for j in range(n):
-                normalised_of_x[r, j] += whitening[r, q] * innovation_of_x[q, j]
-            for j in range(2 * m):
-                normalised_of_signals[r, j] += whitening[r, q] * innovation_of_inputs[q, j]
-            normalised_of_signals[r, 2 * m + q] = whitening[r, q]
-
-    signals, drift = np.zeros((2 * m + p, STRETCH)), np.zeros((n, STRETCH))
-    # The first column of ``normalised`` is the last one of the stretch before.
-    before, normalised = np.zeros((n, STRETCH)), np.zeros((p, STRETCH + 1))
-    products, sums, lagged = np.zeros((p, p, STRETCH)), np.zeros((p, STRETCH)), np.zeros((p, STRETCH))
-    for first in range(0, n_samples, STRETCH):
-        count = min(STRETCH, n_samples - first)
-        for k in range(count):
-            for j in range(m):
-                signals[j, k], signals[m + j, k] = u_before[j], u[first + k, j]
-                u_before[j] = u[first + k, j]
-            for r in range(p):
-                signals[2 * m + r, k] = z[first + k, r]
-        drift[:] = 0.0
-        add_product(drift_of_signals, signals, drift, count)
-        for i in range(n):
-            before[i, 0] = x[i]
-        recursion(columns, drift, x, mean, first, count)
-        for k in range(count - 1):
-            for i in range(n):
-                before[i, k + 1] = mean[first + k, i]
-        for r in range(p):
-            normalised[r, 0] = 0.0 if np.isnan(last[r]) else last[r]
-            normalised[r, 1:] = 0.0
-        add_product(normalised_of_signals, signals, normalised[:, 1:], count)
-        add_product(normalised_of_x, before, normalised[:, 1:], count)
-        for r in range(p):
-            statistics[PAIRS, r] += count - (1 if np.isnan(last[r]) else 0)
-            last[r] = normalised[r, count]
-            for k in range(count):
-                sums[r, k] += normalised[r, k + 1]
-                lagged[r, k] += normalised[r, k + 1] * normalised[r, k]
-            for q in range(r + 1):
-                for k in range(count):
-                    products[r, q, k] += normalised[r, k + 1] * normalised[q, k + 1]
-    gram = np.zeros((p, p))
-    for r in range(p):
-        for q in range(r + 1):
-            gram[r, q] = gram[q, r] = np.sum(products[r, q])
-    for r in range(p):
-        std = root[r, r]
-        statistics[COUNT, r] += n_samples
-        statistics[SUM, r] += std * np.sum(sums[r])
-        statistics[SQUARES, r] += std * std * gram[r, r]
-        statistics[VARIANCES, r] += std * std * n_samples
-        statistics[NIS, r] += gram[r, r]
-        statistics[NORMALISED, r] += np.sum(sums[r])
-        statistics[LAGGED, r] += np.sum(lagged[r])
-        for q in range(r + 1):
-            for j in range(r + 1):
-                statistics[PREDICTION, r] += root[r, q] * root[r, j] * gram[q, j]
+    for r in range(sums.shape[1]):
+        count, pairs = sums[COUNT, r], sums[PAIRS, r]
+        out[0, r] = count
+        if count == 0.0:
+            out[1:, r] = np.nan
+            continue
+        out[1, r] = sums[SUM, r] / count
+        out[2, r] = np.sqrt(sums[SQUARES, r] / count)
+        out[3, r] = np.sqrt(sums[VARIANCES, r] / count)
+        # About the mean, so that a bias does not pass for colour.
+        mean, nis = sums[NORMALISED, r] / count, sums[NIS, r] / count
+        spread = nis - mean * mean
+        lag1 = (sums[LAGGED, r] / pairs - mean * mean) / spread if pairs > 0.0 and spread > 0.0 else np.nan
+        out[4, r] = min(max(lag1, -1.0), 1.0) if count > 2.0 else np.nan
+        out[5, r] = nis
+        out[6, r] = np.sqrt(max(sums[PREDICTION, r], 0.0) / count)
 
 
 @kernel

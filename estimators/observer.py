@@ -14,7 +14,8 @@ from filterpy.kalman import KalmanFilter
 from scipy.linalg import expm
 
 from estimators import kernels
-from estimators.kernels import constant_gain_block, full_covariance_block
+from estimators.kernels import ABSURD, full_covariance_block, summarise
+from estimators.steady import constant_gain_block, steady_filter
 from estimators.types import StateEstimate
 from twin.plant.blocks import Block
 from twin.plant.config import Plant
@@ -100,7 +101,10 @@ class Observer:
         self._variance = np.array([s.noise_variance(sample_rate_hz) for s in chosen])
         self._disturbances = disturbances or Disturbances()
         self._settle_samples = settle_samples
-        self._sensor_columns = [list(channels).index(name) for name in self.sensors]
+        self._sensor_columns = np.array([list(channels).index(name) for name in self.sensors])
+        # A converter at the end of its range says "at least this much".
+        self._ranges = np.array([min((s.range or ABSURD) * (1.0 - 1e-6), ABSURD) for s in chosen])
+        self._limits = np.concatenate([np.full(2 * len(self.sources), ABSURD), self._ranges])
         self._drive = DriveReader(self.sources, channels)
         self._u_before: Array | None = None
         self._settled, self._stretch_done = True, 0
@@ -138,10 +142,13 @@ class Observer:
         prior, _, _ = dare(kf.F.T, kf.H.T, kf.Q, kf.R)
         prior = 0.5 * (prior + prior.T)
         residual = kf.H @ prior @ kf.H.T + kf.R
-        self._gain = np.ascontiguousarray(np.linalg.solve(residual, kf.H @ prior).T)
-        self.steady_covariance = read_only(prior - self._gain @ residual @ self._gain.T)
-        self._root = np.ascontiguousarray(np.linalg.cholesky(residual))
-        self._whitening = np.linalg.inv(self._root)
+        gain = np.linalg.solve(residual, kf.H @ prior).T
+        self.steady_covariance = read_only(prior - gain @ residual @ gain.T)
+        self._inputs = read_only(B0), read_only(B1)
+        self._frozen = steady_filter(
+            kf.F, B0, B1, kf.H, self.feedthrough, gain, residual, np.sqrt(np.diag(prior))
+        )
+        self._modes: tuple[Array, Array] | None = None
         self._settled, self._stretch_done = False, 0
 
     def advance(self, block: Block) -> StateEstimate:
@@ -151,64 +158,89 @@ class Observer:
         last valid one, since the model must be driven by something.
         """
         kf = self.filter
-        z = block.values.take(self._sensor_columns, axis=1)
         # A look at the whole block is cheap; the sensors' columns matter only if it finds something.
         whole = bool(block.valid.all()) or bool(block.valid.take(self._sensor_columns, axis=1).all())
         u = self._drive.gather(block)
         if self._u_before is None:
-            self._u_before = u[0].copy()
-        x, P = kf.x[:, 0].copy(), np.ascontiguousarray(kf.P, dtype=np.float64)
-        mean = np.empty((len(z), len(x)))
-        statistics = np.zeros((kernels.STATISTICS, len(self.sensors)))
+            self._u_before = np.where(np.abs(u[0]) < ABSURD, u[0], 0.0)
+        mean = np.empty((len(u), len(kf.x)))
+        sums = np.zeros((kernels.STATISTICS, len(self.sensors)))
         last = np.full(len(self.sensors), np.nan)
-        m = len(self.sources)
-        B0, B1 = np.ascontiguousarray(kf.B[:, :m]), np.ascontiguousarray(kf.B[:, m:])
         n_full = 0
-        while n_full < len(z) and not (whole and self._settled):
+        while n_full < len(u):
+            if whole and self._settled:
+                if self._advance_frozen(block, u, n_full, last, mean, sums):
+                    break
+                whole = False  # it said so, but something in it passes a sensor's range or is no number
             # Counted across blocks, so that where a run is cut does not decide when the gain is frozen.
             stretch = slice(n_full, n_full + self._settle_samples - self._stretch_done)
-            valid = block.valid[stretch].take(self._sensor_columns, axis=1)
-            full_covariance_block(
-                kf.F, B0, B1, kf.H, self.feedthrough, kf.Q, self._variance, x, P, self._u_before,
-                u[stretch], z[stretch], valid, last, mean[stretch], statistics,
-            )  # fmt: skip
-            n_full += len(valid)
-            self._stretch_done += len(valid)
-            self._settled = False
-            if self._stretch_done == self._settle_samples:
-                self._settled, self._stretch_done = self._is_steady(P), 0
-        if n_full < len(z):
-            P = np.array(self.steady_covariance)
-            constant_gain_block(
-                kf.F, B0, B1, kf.H, self.feedthrough, self._gain, self._root, self._whitening,
-                x, self._u_before, u[n_full:], z[n_full:], last, mean[n_full:], statistics,
-            )  # fmt: skip
-        kf.x, kf.P = x[:, None], P
+            n_full += self._advance_full(block, u, stretch, last, mean, sums)
         mean.flags.writeable = False
-        return self._estimate(mean, P, statistics)
+        return self._estimate(mean, sums)
 
-    def _estimate(self, mean: Array, P: Array, sums: Array) -> StateEstimate:
-        count, pairs = sums[kernels.COUNT], sums[kernels.PAIRS]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            normalised_mean = sums[kernels.NORMALISED] / count
-            nis = sums[kernels.NIS] / count
-            lag1 = (sums[kernels.LAGGED] / pairs - normalised_mean**2) / (nis - normalised_mean**2)
-            means = {
-                "innovation_rms": np.sqrt(sums[kernels.SQUARES] / count),
-                "innovation_std": np.sqrt(sums[kernels.VARIANCES] / count),
-                "innovation_mean": sums[kernels.SUM] / count,
-                "prediction_rms": np.sqrt(sums[kernels.PREDICTION] / count),
-            }
+    def _advance_frozen(
+        self, block: Block, u: Array, first: int, last: Array, mean: Array, sums: Array
+    ) -> bool:
+        """Run from row ``first`` on with the steady gain; False, and nothing is changed, if a sample is invalid."""
+        kf, frozen = self.filter, self._frozen
+        x = kf.x[:, 0]
+        # Modal coordinates are kept: going to the states and back would leave traces of where a run is cut.
+        if self._modes is not None and np.array_equal(self._modes[0], x):
+            modes = self._modes[1].copy()
+        else:
+            modes = frozen.inverse @ x
+        before, last_now, sums_now = self._u_before.copy(), last.copy(), sums.copy()
+        if not constant_gain_block(
+            frozen.pairs, frozen.columns, frozen.of_signals, frozen.shapes, frozen.normalised_of_modes,
+            frozen.normalised_of_signals, frozen.root, self._limits, modes, before, u[first:], block.values[first:],
+            self._sensor_columns, last_now, mean[first:], sums_now,
+        ):  # fmt: skip
+            return False
+        self._u_before, last[:], sums[:] = before, last_now, sums_now
+        self._modes = mean[-1].copy(), modes
+        kf.x, kf.P = mean[-1][:, None].copy(), self.steady_covariance.copy()
+        return True
+
+    def _advance_full(
+        self, block: Block, u: Array, stretch: slice, last: Array, mean: Array, sums: Array
+    ) -> int:
+        """Run some rows with the full covariance; how many there were."""
+        kf = self.filter
+        x, P = kf.x[:, 0].copy(), np.array(kf.P, dtype=np.float64, order="C")
+        z = block.values[stretch].take(self._sensor_columns, axis=1)
+        valid = block.valid[stretch].take(self._sensor_columns, axis=1)
+        with np.errstate(invalid="ignore"):
+            valid &= np.abs(z) < self._ranges
+        full_covariance_block(
+            kf.F, *self._inputs, kf.H, self.feedthrough, kf.Q, self._variance, x, P, self._u_before,
+            u[stretch], z, valid, last, mean[stretch], sums,
+        )  # fmt: skip
+        kf.x, kf.P = x[:, None], P
+        self._stretch_done += len(z)
+        self._settled = False
+        if self._stretch_done == self._settle_samples:
+            self._settled, self._stretch_done = self._is_steady(P), 0
+        return len(z)
+
+    def _estimate(self, mean: Array, sums: Array) -> StateEstimate:
+        figures = np.empty((7, len(self.sensors)))
+        summarise(sums, figures)
+        figures.flags.writeable = False
+        count, average, rms, std, lag1, nis, prediction = figures
+        total = float(count.sum())
         return StateEstimate(
             states=self.states,
             mean=mean,
-            covariance=read_only(P),
-            nis=float(sums[kernels.NIS].sum() / count.sum()) if count.sum() else float("nan"),
+            covariance=read_only(self.filter.P),
+            innovation_rms=rms,
+            innovation_std=std,
+            nis=float(sums[kernels.NIS].sum()) / total if total else float("nan"),
             sensors=self.sensors,
-            innovation_count=read_only(count),
-            innovation_lag1=read_only(np.where((pairs > 0) & (count > 2), np.clip(lag1, -1.0, 1.0), np.nan)),
-            nis_per_sensor=read_only(nis),
-            **{name: read_only(values) for name, values in means.items()},
+            innovation_count=count,
+            innovation_mean=average,
+            innovation_lag1=lag1,
+            nis_per_sensor=nis,
+            prediction_rms=prediction,
         )
 
     def _is_steady(self, P: Array) -> bool:

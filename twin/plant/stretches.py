@@ -12,21 +12,60 @@ STRETCH = 120
 
 
 @kernel
-def add_product(matrix: Array, rows: Array, out: Array, count: int) -> None:
-    """``out += matrix @ rows`` for the first ``count`` columns; the innermost loops run along contiguous time."""
-    n = matrix.shape[1]
-    for r in range(matrix.shape[0]):
-        c = 0
+def add_product(
+    matrix: Array,
+    rows: Array,
+    out: Array,
+    count: int,
+    rows_from: int = 0,
+    out_from: int = 0,
+    keep: bool = True,
+) -> None:
+    """``out += matrix @ rows`` for ``count`` columns; the innermost loops run along contiguous time.
+
+    Both arrays must own their memory row after row: processors do not take several samples of a slice at once,
+    which is why the columns to begin with, ``rows_from`` and ``out_from``, are arguments. Without ``keep`` what was
+    in ``out`` does not count: ``out = matrix @ rows``.
+    """
+    m, n = matrix.shape
+    r = 0
+    # Two rows share what they read.
+    while r + 2 <= m:
+        c, kept = 0, keep
+        while c + 4 <= n:
+            a, b, d, e = matrix[r, c], matrix[r, c + 1], matrix[r, c + 2], matrix[r, c + 3]
+            f, g, h, i = matrix[r + 1, c], matrix[r + 1, c + 1], matrix[r + 1, c + 2], matrix[r + 1, c + 3]
+            for k in range(count):
+                v, w = rows[c, k + rows_from], rows[c + 1, k + rows_from]
+                x, y = rows[c + 2, k + rows_from], rows[c + 3, k + rows_from]
+                before, below = (out[r, k + out_from], out[r + 1, k + out_from]) if kept else (0.0, 0.0)
+                out[r, k + out_from] = before + ((a * v + b * w) + (d * x + e * y))
+                out[r + 1, k + out_from] = below + ((f * v + g * w) + (h * x + i * y))
+            c, kept = c + 4, True
+        while c < n:
+            a, b = matrix[r, c], matrix[r + 1, c]
+            for k in range(count):
+                before, below = (out[r, k + out_from], out[r + 1, k + out_from]) if kept else (0.0, 0.0)
+                out[r, k + out_from] = before + a * rows[c, k + rows_from]
+                out[r + 1, k + out_from] = below + b * rows[c, k + rows_from]
+            c, kept = c + 1, True
+        r += 2
+    if r < m:
+        c, kept = 0, keep
         while c + 4 <= n:
             a, b, d, e = matrix[r, c], matrix[r, c + 1], matrix[r, c + 2], matrix[r, c + 3]
             for k in range(count):
-                out[r, k] += (a * rows[c, k] + b * rows[c + 1, k]) + (d * rows[c + 2, k] + e * rows[c + 3, k])
-            c += 4
+                v, w = rows[c, k + rows_from], rows[c + 1, k + rows_from]
+                x, y = rows[c + 2, k + rows_from], rows[c + 3, k + rows_from]
+                before = out[r, k + out_from] if kept else 0.0
+                out[r, k + out_from] = before + ((a * v + b * w) + (d * x + e * y))
+            c, kept = c + 4, True
         while c < n:
             a = matrix[r, c]
             for k in range(count):
-                out[r, k] += a * rows[c, k]
-            c += 1
+                before = out[r, k + out_from] if kept else 0.0
+                out[r, k + out_from] = before + a * rows[c, k + rows_from]
+            c, kept = c + 1, True
 
 
 @kernel
