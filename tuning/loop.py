@@ -312,10 +312,7 @@ class Margins:
 
 
 def margins(terms: ComplexArray, frequency_hz: Array, gains: Gains, longest_delay_s: float = 8e-3) -> Margins:
-    """Modulus and delay margin of a stable loop from its gain on a dense grid.
-
-    The delay margin is exact for the grid's crossings of |L| = 1, interpolated linearly; None if no delay below
-    ``longest_delay_s`` destabilises.
+    """Margins of the rig's own law, see `loop_margins`.
 
     Parameters
     ----------
@@ -325,6 +322,22 @@ def margins(terms: ComplexArray, frequency_hz: Array, gains: Gains, longest_dela
         (n,) ascending [Hz].
     """
     L = terms @ np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
+    return loop_margins(L, frequency_hz, longest_delay_s)
+
+
+def loop_margins(L: ComplexArray, frequency_hz: Array, longest_delay_s: float = 8e-3) -> Margins:
+    """Modulus and delay margin of a stable loop from its gain on a dense grid.
+
+    The delay margin is exact for the grid's crossings of |L| = 1, interpolated linearly; None if no delay below
+    ``longest_delay_s`` destabilises.
+
+    Parameters
+    ----------
+    L
+        (n,) loop gain in the sign of negative feedback.
+    frequency_hz
+        (n,) ascending [Hz].
+    """
     modulus = float(np.min(np.abs(1.0 + L)))
     size = np.abs(L) - 1.0
     crossing = np.nonzero(size[:-1] * size[1:] < 0.0)[0]
