@@ -13,7 +13,7 @@ from estimators.observer import Observer
 from twin.plant.blocks import Channel, make_block
 from twin.plant.config import Plant
 from twin.plant.files import load_plant
-from twin.rig.npz import open_npz
+from twin.rig.foreign import open_foreign
 
 Array = NDArray[np.float64]
 STEP_S = 0.01
@@ -29,7 +29,7 @@ def plant() -> Plant:
 
 @pytest.fixture(scope="module")
 def recorded(realdata: Path, plant: Plant) -> tuple[Array, Array]:
-    recording = open_npz(realdata / "beam_closed_lq.npz", plant)
+    recording = open_foreign(realdata / "beam_closed_lq.npz", plant)
     assert [c.name for c in recording.channels] == ["tip_displacement", "piezo"]
     return recording.values[:, 0], recording.values[:, 1]
 

@@ -15,7 +15,7 @@ from twin.plant.blocks import Block, Channel
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
-from twin.rig.npz import open_npz
+from twin.rig.foreign import open_foreign
 from twin.rig.recorded import open_recording
 from twin.station.outputs import Outputs
 from twin.station.prediction import PredictionScore
@@ -172,15 +172,9 @@ def open_any(path: Path, options: ReplayOptions) -> Opened:
     """
     if not path.exists():
         raise InputError(f"{path}: no such recording; check the path")
-    match path.suffix.lower():
-        case ".rrd":
-            return _open_own(path, options)
-        case ".npz":
-            return _open_foreign(path, options)
-        case other:
-            raise InputError(
-                f"{path}: recordings of format '{other or path.name}' cannot be read; known: .rrd, .npz"
-            )
+    if path.suffix.lower() == ".rrd":
+        return _open_own(path, options)
+    return _open_foreign(path, options)
 
 
 def _open_own(path: Path, options: ReplayOptions) -> Opened:
@@ -223,7 +217,7 @@ def _open_foreign(path: Path, options: ReplayOptions) -> Opened:
     if options.plant is None:
         raise InputError(f"{path}: says nothing about its plant; add --plant PRESET or --plant FILE.toml")
     plant = load_plant(options.plant)
-    recording = open_npz(
+    recording = open_foreign(
         path, plant, channels=options.channels, sample_rate_hz=options.sample_rate_hz, sidecar=options.sidecar
     )
     remarks = [*(str(entry) for entry in recording.mapping), *recording.notes]

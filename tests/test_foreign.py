@@ -15,7 +15,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant, parse_toml
 from twin.rig.arrayref import ArrayRef, parse_array_ref
-from twin.rig.npz import NpzRecording, open_npz
+from twin.rig.foreign import ForeignRecording, open_foreign
 from twin.rig.units import to_si, units_for
 
 RATE_HZ = 100.0
@@ -74,7 +74,7 @@ def said(error: pytest.ExceptionInfo[InputError]) -> str:
 def test_option_comes_before_every_other_way(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), tip=np.ones(50), y=np.full(50, 3.0), z=np.full(50, 5.0), piezo=np.zeros(50))
     (tmp_path / "run.toml").write_text('[channels]\ntip = "z:mm"\n')
-    recording = open_npz(path, plant(), channels={"tip": "y:mm"})
+    recording = open_foreign(path, plant(), channels={"tip": "y:mm"})
     assert recording.values[0, 0] == pytest.approx(3e-3)
     assert [m.decided for m in recording.mapping] == ["as given", "equal names; no unit stated, taken as SI"]
 
@@ -82,21 +82,21 @@ def test_option_comes_before_every_other_way(save: Save, tmp_path: Path) -> None
 def test_sidecar_comes_before_recorded_as_and_that_before_equal_names(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), tip=np.ones(50), y=np.full(50, 3.0), z=np.full(50, 5.0), piezo=np.zeros(50))
     of_plant = plant(recorded_as="y:mm")
-    assert open_npz(path, of_plant).values[0, 0] == pytest.approx(3e-3)
+    assert open_foreign(path, of_plant).values[0, 0] == pytest.approx(3e-3)
     (tmp_path / "run.toml").write_text('[channels]\ntip = { array = "z", unit = "mm" }\n')
-    assert open_npz(path, of_plant).values[0, 0] == pytest.approx(5e-3)
-    assert open_npz(path, of_plant).mapping[0].decided == "from run.toml"
+    assert open_foreign(path, of_plant).values[0, 0] == pytest.approx(5e-3)
+    assert open_foreign(path, of_plant).mapping[0].decided == "from run.toml"
 
 
 def test_recorded_as_gives_way_to_equal_names_where_its_array_is_missing(save: Save) -> None:
-    recording = open_npz(save(t=t(), tip=np.ones(50), piezo=np.zeros(50)), plant(recorded_as="y:mm"))
+    recording = open_foreign(save(t=t(), tip=np.ones(50), piezo=np.zeros(50)), plant(recorded_as="y:mm"))
     assert recording.mapping[0].array == "tip"
 
 
 def test_unit_beside_the_recording_outranks_the_plants_own(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), y=np.ones(50), piezo=np.zeros(50))
     (tmp_path / "run.json").write_text(json.dumps({"channels": {"y": "um laser"}}))
-    mapping = open_npz(path, plant(recorded_as="y:mm")).mapping[0]
+    mapping = open_foreign(path, plant(recorded_as="y:mm")).mapping[0]
     assert (mapping.unit, mapping.factor) == ("um", 1e-6)
     assert mapping.decided == "the plant's recorded_as; unit from run.json"
 
@@ -105,9 +105,10 @@ def test_option_that_contradicts_the_sidecar_wins_and_says_so(save: Save, tmp_pa
     path = save(t=t(), y=np.ones(50), piezo=np.zeros(50))
     (tmp_path / "run.json").write_text(json.dumps({"channels": {"y": "um laser"}}))
     assert (
-        open_npz(path, plant(), channels={"tip": "y:mm"}).mapping[0].decided == "as given; run.json says um"
+        open_foreign(path, plant(), channels={"tip": "y:mm"}).mapping[0].decided
+        == "as given; run.json says um"
     )
-    assert open_npz(path, plant(), channels={"tip": "y"}).mapping[0].factor == 1e-6
+    assert open_foreign(path, plant(), channels={"tip": "y"}).mapping[0].factor == 1e-6
 
 
 def test_single_channel_left_over_is_guessed_by_its_unit_and_called_a_guess(
@@ -117,7 +118,7 @@ def test_single_channel_left_over_is_guessed_by_its_unit_and_called_a_guess(
     (tmp_path / "run.json").write_text(
         json.dumps({"channels": {"laser": "mm tip", "noise": "unknown", "force": "N"}})
     )
-    mapping = open_npz(path, plant()).mapping[0]
+    mapping = open_foreign(path, plant()).mapping[0]
     assert str(mapping) == (
         "tip <- laser [mm -> m, x 0.001]: guessed: the only array left in mm; unit from run.json"
     )
@@ -127,7 +128,7 @@ def test_two_candidates_are_named_and_none_is_taken(save: Save, tmp_path: Path) 
     path = save(t=t(), tip=np.ones(50), u=np.ones(50), v=np.zeros(50))
     (tmp_path / "run.json").write_text(json.dumps({"channels": {"u": "V", "v": "mV, amplifier"}}))
     with pytest.raises(InputError) as error:
-        open_npz(path, plant())
+        open_foreign(path, plant())
     assert said(error) == (
         f"{path}: no array for channel 'piezo' [V] (could be u or v); give --channel piezo=ARRAY:UNIT, "
         f"or --channel piezo=none if it was not recorded\n{path}: arrays in the file: t, tip, u, v"
@@ -138,14 +139,14 @@ def test_with_two_channels_missing_nothing_is_guessed(save: Save, tmp_path: Path
     path = save(t=t(), y=np.ones(50), u=np.ones(50))
     (tmp_path / "run.json").write_text(json.dumps({"channels": {"u": "V", "y": "mm"}}))
     with pytest.raises(InputError, match=r"'tip' \[m\] \(could be y\)[^$]*'piezo' \[V\] \(could be u\)"):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_command_that_was_not_recorded_is_left_out_when_a_person_says_so(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), tip=np.ones(50))
-    by_option = open_npz(path, plant(), channels={"piezo": "none"})
+    by_option = open_foreign(path, plant(), channels={"piezo": "none"})
     (tmp_path / "run.toml").write_text('[channels]\npiezo = "none"\n')
-    by_sidecar = open_npz(path, plant())
+    by_sidecar = open_foreign(path, plant())
     assert [c.name for c in by_option.channels] == [c.name for c in by_sidecar.channels] == ["tip"]
     assert "piezo: not recorded (as given)" in by_option.notes
     assert "piezo: not recorded (from run.toml)" in by_sidecar.notes
@@ -153,18 +154,18 @@ def test_command_that_was_not_recorded_is_left_out_when_a_person_says_so(save: S
 
 def test_recording_without_any_sensor_is_refused(save: Save) -> None:
     with pytest.raises(InputError, match="no sensor of plant 'beam' is in it"):
-        open_npz(save(t=t(), piezo=np.ones(50)), plant(), channels={"tip": "none"})
+        open_foreign(save(t=t(), piezo=np.ones(50)), plant(), channels={"tip": "none"})
 
 
 def test_channels_keep_the_plants_order_and_units(save: Save) -> None:
     path = save(piezo=np.zeros(5), tip=np.ones(5))
-    recording = open_npz(path, plant(), sample_rate_hz=10.0)
+    recording = open_foreign(path, plant(), sample_rate_hz=10.0)
     assert [(c.name, c.unit) for c in recording.channels] == [("tip", "m"), ("piezo", "V")]
 
 
 def test_misspelt_channel_in_an_option_is_refused_with_the_plants_channels(save: Save) -> None:
     with pytest.raises(InputError, match=r"--channel tpi=y: plant 'beam' has no channel 'tpi'.*tip, piezo"):
-        open_npz(save(t=t(), y=np.ones(50)), plant(), channels={"tpi": "y"})
+        open_foreign(save(t=t(), y=np.ones(50)), plant(), channels={"tpi": "y"})
 
 
 def test_sidecar_may_name_channels_of_a_larger_plant(save: Save, tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_sidecar_may_name_channels_of_a_larger_plant(save: Save, tmp_path: Path)
     (tmp_path / "run.toml").write_text('[channels]\nother = "t"\n')
     assert (
         "run.toml names channel 'other', which plant 'beam' has not: not used"
-        in open_npz(path, plant()).notes
+        in open_foreign(path, plant()).notes
     )
 
 
@@ -180,21 +181,22 @@ def test_array_named_but_not_there_lists_what_is(save: Save) -> None:
     with pytest.raises(
         InputError, match="'tip': no array 'yy' in the file \\(as given\\); arrays: t, y, piezo"
     ):
-        open_npz(save(t=t(), y=t(), piezo=t()), plant(), channels={"tip": "yy:mm"})
+        open_foreign(save(t=t(), y=t(), piezo=t()), plant(), channels={"tip": "yy:mm"})
 
 
 def test_plant_beside_a_recording_is_not_taken_for_its_sidecar(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), tip=np.ones(50), piezo=np.zeros(50))
     (tmp_path / "run.toml").write_text('name = "x"\n[[body]]\nname = "b"\n')
     assert (
-        "run.toml beside the recording is a plant, not a sidecar: not used" in open_npz(path, plant()).notes
+        "run.toml beside the recording is a plant, not a sidecar: not used"
+        in open_foreign(path, plant()).notes
     )
 
 
 def test_plant_without_channels_has_nothing_to_read(save: Save) -> None:
     bare = Plant.model_validate(plant().model_dump() | {"sensor": (), "actuator": ()})
     with pytest.raises(InputError, match="has no sensors or actuators"):
-        open_npz(save(t=t(), tip=t()), bare)
+        open_foreign(save(t=t(), tip=t()), bare)
 
 
 # --- units ----------------------------------------------------------------------------------------------
@@ -225,7 +227,7 @@ def test_unknown_units_are_not_guessed_at(unit: str) -> None:
 def test_unit_that_does_not_fit_is_refused_with_those_that_do(save: Save, unit: str, why: str) -> None:
     path = save(t=t(), y=t(), piezo=t())
     with pytest.raises(InputError) as error:
-        open_npz(path, plant(), channels={"tip": f"y:{unit}"})
+        open_foreign(path, plant(), channels={"tip": f"y:{unit}"})
     assert said(error) == (
         f"{path}: channel 'tip' <- y: {why}; give --channel tip=y:UNIT with one of m, nm, um, mm"
     )
@@ -238,14 +240,14 @@ def test_column_of_a_matrix_and_record_of_a_stack_can_be_named(save: Save) -> No
     rng = np.random.default_rng(1)
     table, stack = rng.normal(size=(50, 3)), rng.normal(size=(10, 3, 50)).astype(np.float32)
     path = save(t=t(), table=table, stack=stack)
-    recording = open_npz(path, plant(), channels={"tip": "table[:,2]:mm", "piezo": "stack[3, -1, :]"})
+    recording = open_foreign(path, plant(), channels={"tip": "table[:,2]:mm", "piezo": "stack[3, -1, :]"})
     np.testing.assert_allclose(recording.values[:, 0], table[:, 2] * 1e-3)
     np.testing.assert_allclose(recording.values[:, 1], stack[3, -1])
     assert [m.array for m in recording.mapping] == ["table[:,2]", "stack[3,-1,:]"]
 
 
 def test_column_vectors_need_no_index(save: Save) -> None:
-    recording = open_npz(save(t=t()[:, None], tip=np.ones((50, 1)), piezo=np.ones((1, 50))), plant())
+    recording = open_foreign(save(t=t()[:, None], tip=np.ones((50, 1)), piezo=np.ones((1, 50))), plant())
     assert recording.values.shape == (50, 2)
 
 
@@ -287,51 +289,54 @@ def test_other_forms_are_refused_with_an_example(text: str) -> None:
 def test_index_that_does_not_fit_says_what_the_array_is(save: Save, ref: str, why: str) -> None:
     path = save(t=t(), table=np.ones((50, 3)), number=np.float64(3.0), piezo=t())
     with pytest.raises(InputError, match=why):
-        open_npz(path, plant(), channels={"tip": ref})
+        open_foreign(path, plant(), channels={"tip": ref})
 
 
 # --- sample rate ----------------------------------------------------------------------------------------
 
 
-def rate_of(recording: NpzRecording) -> tuple[float, str]:
+def rate_of(recording: ForeignRecording) -> tuple[float, str]:
     return recording.sample_rate_hz, recording.notes[0]
 
 
 @pytest.mark.parametrize("name", ["t", "time"])
 def test_rate_is_read_off_even_time_stamps(save: Save, name: str) -> None:
     path = save(tip=t(), piezo=t(), **{name: 7.0 + t(50, 50_000.0)})
-    assert rate_of(open_npz(path, plant())) == (50_000.0, f"sample rate 50000 Hz from time array '{name}'")
+    assert rate_of(open_foreign(path, plant())) == (
+        50_000.0,
+        f"sample rate 50000 Hz from time array '{name}'",
+    )
 
 
 def test_rounded_but_even_stamps_give_the_mean_rate(save: Save) -> None:
     path = save(tip=np.ones(2000), piezo=np.ones(2000), t=np.round(t(2000, 300.0), 5))
-    assert open_npz(path, plant()).sample_rate_hz == pytest.approx(300.0, rel=1e-5)
+    assert open_foreign(path, plant()).sample_rate_hz == pytest.approx(300.0, rel=1e-5)
 
 
 def test_time_array_and_its_unit_can_be_named(save: Save, tmp_path: Path) -> None:
     path = save(tip=t(), piezo=t(), clock=t() * 1e3)
     (tmp_path / "run.toml").write_text('time = "clock:ms"\n')
-    assert open_npz(path, plant()).sample_rate_hz == 100.0
+    assert open_foreign(path, plant()).sample_rate_hz == 100.0
 
 
 def test_time_array_named_but_not_there_is_refused(save: Save, tmp_path: Path) -> None:
     path = save(tip=t(), piezo=t())
     (tmp_path / "run.toml").write_text('time = "clock"\n')
     with pytest.raises(InputError, match=r"run\.toml names time array 'clock', which is not in the file"):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_time_in_a_unit_of_length_is_refused(save: Save, tmp_path: Path) -> None:
     path = save(tip=t(), piezo=t(), clock=t())
     (tmp_path / "run.toml").write_text('time = "clock:mm"\n')
     with pytest.raises(InputError, match="time array 'clock' is in 'mm', which is no unit of time"):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_uneven_stamps_alone_are_refused_with_their_steps(save: Save) -> None:
     path = save(tip=np.ones(5), piezo=np.ones(5), t=np.array([0.0, 0.01, 0.01, 0.02, 0.04]))
     with pytest.raises(InputError) as error:
-        open_npz(path, plant())
+        open_foreign(path, plant())
     assert said(error) == (
         f"{path}: time array 't' is not evenly spaced (steps of 0 to 20 ms, median 10 ms); give the rate it was "
         "sampled at with --sample-rate HZ, or sample_rate_hz in a sidecar"
@@ -341,7 +346,7 @@ def test_uneven_stamps_alone_are_refused_with_their_steps(save: Save) -> None:
 def test_uneven_stamps_are_set_aside_for_a_nominal_rate_and_that_is_said(save: Save, tmp_path: Path) -> None:
     path = save(tip=np.ones(5), piezo=np.ones(5), t=np.array([0.0, 0.01, 0.01, 0.02, 0.04]))
     (tmp_path / "run.json").write_text('{"fs_hz": 128}')
-    rate, note = rate_of(open_npz(path, plant()))
+    rate, note = rate_of(open_foreign(path, plant()))
     assert rate == 128.0
     assert note.endswith("(steps of 0 to 20 ms, median 10 ms), so it is not used")
 
@@ -358,33 +363,33 @@ def test_uneven_stamps_are_set_aside_for_a_nominal_rate_and_that_is_said(save: S
 )
 def test_stamps_that_carry_no_rate_are_refused(save: Save, stamps: np.ndarray, why: str) -> None:
     with pytest.raises(InputError, match=rf"time array 't' .*{why}.*--sample-rate HZ"):
-        open_npz(save(tip=np.ones(5), piezo=np.ones(5), t=stamps), plant())
+        open_foreign(save(tip=np.ones(5), piezo=np.ones(5), t=stamps), plant())
 
 
 def test_single_sample_has_no_rate_of_its_own(save: Save) -> None:
     path = save(tip=np.ones(1), piezo=np.ones(1), t=np.zeros(1))
     with pytest.raises(InputError, match="has a single stamp"):
-        open_npz(path, plant())
-    assert len(list(open_npz(path, plant(), sample_rate_hz=10.0).blocks())) == 1
+        open_foreign(path, plant())
+    assert len(list(open_foreign(path, plant(), sample_rate_hz=10.0).blocks())) == 1
 
 
 def test_even_stamps_that_contradict_the_sidecar_are_not_settled_silently(save: Save, tmp_path: Path) -> None:
     path = save(tip=t(), piezo=t(), t=t())
     (tmp_path / "run.json").write_text('{"fs_hz": 1000}')
     with pytest.raises(InputError, match=r"'t' says 100 Hz but run\.json says 1000 Hz; correct the sidecar"):
-        open_npz(path, plant())
-    assert rate_of(open_npz(path, plant(), sample_rate_hz=50.0)) == (50.0, "sample rate 50 Hz as given")
+        open_foreign(path, plant())
+    assert rate_of(open_foreign(path, plant(), sample_rate_hz=50.0)) == (50.0, "sample rate 50 Hz as given")
 
 
 def test_no_rate_at_all_is_refused_with_the_remedy(save: Save) -> None:
     with pytest.raises(InputError, match="no sample rate: it has no time array 't' or 'time'; give the rate"):
-        open_npz(save(tip=t(), piezo=t()), plant())
+        open_foreign(save(tip=t(), piezo=t()), plant())
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
 def test_rate_given_must_be_positive(save: Save, rate: float) -> None:
     with pytest.raises(InputError, match=r"sample rate \[Hz\]: must be a positive number"):
-        open_npz(save(tip=t(), piezo=t()), plant(), sample_rate_hz=rate)
+        open_foreign(save(tip=t(), piezo=t()), plant(), sample_rate_hz=rate)
 
 
 # --- blocks ---------------------------------------------------------------------------------------------
@@ -392,7 +397,7 @@ def test_rate_given_must_be_positive(save: Save, rate: float) -> None:
 
 def test_blocks_follow_each_other_and_the_last_is_shorter(save: Save) -> None:
     tip = np.linspace(0.0, 1e-3, 25)
-    recording = open_npz(save(t=t(25), tip=tip, piezo=tip), plant(), block_s=0.1)
+    recording = open_foreign(save(t=t(25), tip=tip, piezo=tip), plant(), block_s=0.1)
     blocks = list(recording.blocks())
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 10), (10, 10), (20, 5)]
     np.testing.assert_array_equal(np.concatenate([b.values[:, 0] for b in blocks]), tip)
@@ -401,7 +406,7 @@ def test_blocks_follow_each_other_and_the_last_is_shorter(save: Save) -> None:
 
 def test_missing_and_saturated_samples_are_masked_not_passed_on(save: Save) -> None:
     tip = np.array([1e-3, np.nan, np.inf, 0.015, -0.015, 0.0149])
-    (block,) = open_npz(
+    (block,) = open_foreign(
         save(tip=tip, piezo=np.full(6, 200.0)), plant(), sample_rate_hz=10.0, block_s=1
     ).blocks()
     np.testing.assert_array_equal(block.valid[:, 0], [True, False, False, False, False, True])
@@ -413,18 +418,18 @@ def test_missing_and_saturated_samples_are_masked_not_passed_on(save: Save) -> N
 @pytest.mark.parametrize("block_s", [0.0, -0.1, float("nan"), float("inf")])
 def test_block_length_must_be_positive(save: Save, block_s: float) -> None:
     with pytest.raises(InputError, match=r"block length \[s\]"):
-        open_npz(save(t=t(), tip=t(), piezo=t()), plant(), block_s=block_s)
+        open_foreign(save(t=t(), tip=t(), piezo=t()), plant(), block_s=block_s)
 
 
 def test_integers_and_foreign_byte_orders_are_numbers_too(save: Save) -> None:
     tip = np.arange(50)
-    recording = open_npz(save(t=t(), tip=tip.astype("i2"), piezo=tip.astype(">f4")), plant())
+    recording = open_foreign(save(t=t(), tip=tip.astype("i2"), piezo=tip.astype(">f4")), plant())
     np.testing.assert_array_equal(recording.values, np.column_stack([tip, tip]))
 
 
 def test_numbers_too_large_for_their_unit_are_masked(save: Save) -> None:
     path = save(t=t(), tip=np.zeros(50), piezo=np.full(50, 1e308))
-    assert not next(open_npz(path, plant(), channels={"piezo": "piezo:kV"}).blocks()).valid[:, 1].any()
+    assert not next(open_foreign(path, plant(), channels={"piezo": "piezo:kV"}).blocks()).valid[:, 1].any()
 
 
 # --- what is refused ------------------------------------------------------------------------------------
@@ -432,16 +437,17 @@ def test_numbers_too_large_for_their_unit_are_masked(save: Save) -> None:
 
 def test_missing_file_and_directory(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.npz: no such file; check the path"):
-        open_npz(tmp_path / "none.npz", plant())
-    with pytest.raises(InputError, match=r"is a directory; give the \.npz file in it"):
-        open_npz(tmp_path, plant())
+        open_foreign(tmp_path / "none.npz", plant())
+    with pytest.raises(InputError, match=r"is a directory; give a file in it"):
+        open_foreign(tmp_path, plant())
 
 
 @pytest.mark.parametrize(
     ("content", "why"),
     [
         (b"", "is empty; copy or export"),
-        (b"time,y\n0,1\n", r"is not a NumPy \.npz archive; save the recording with numpy\.savez"),
+        (b"\x7fELF\0\0\0", r"is of no known format; recordings are read from \.npz, \.tdms"),
+        (b"Dear reader,\nhere is no number.\n", "no row of numbers in its first 2 lines"),
         (b"\x93NUMPY\x01\x00", r"is a single \.npy array, not an \.npz"),
         (b"PK\x03\x04 and no more", "is cut short or damaged"),
     ],
@@ -450,7 +456,7 @@ def test_files_of_another_kind(tmp_path: Path, content: bytes, why: str) -> None
     path = tmp_path / "x.npz"
     path.write_bytes(content)
     with pytest.raises(InputError, match=why):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_archive_without_arrays(tmp_path: Path) -> None:
@@ -458,29 +464,29 @@ def test_archive_without_arrays(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("readme.txt", "nothing")
     with pytest.raises(InputError, match="holds no arrays"):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_pickled_objects_are_never_loaded(save: Save) -> None:
     path = save(t=t(), tip=np.array([{"a": 1}] * 50, dtype=object), piezo=t())
     with pytest.raises(InputError, match="array 'tip' holds Python objects, which are never loaded"):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 @pytest.mark.parametrize("kind", [complex, bool, str, "M8[s]"])
 def test_what_is_not_a_real_number_is_refused(save: Save, kind: str) -> None:
     with pytest.raises(InputError, match=r"array 'tip' holds .*, not real numbers; channel 'tip' \[m\]"):
-        open_npz(save(t=t(), tip=np.zeros(50).astype(int).astype(kind), piezo=t()), plant())
+        open_foreign(save(t=t(), tip=np.zeros(50).astype(int).astype(kind), piezo=t()), plant())
 
 
 def test_empty_arrays(save: Save) -> None:
     with pytest.raises(InputError, match="array 'tip' is empty; there is nothing to replay"):
-        open_npz(save(tip=np.zeros(0), piezo=np.zeros(0)), plant(), sample_rate_hz=10.0)
+        open_foreign(save(tip=np.zeros(0), piezo=np.zeros(0)), plant(), sample_rate_hz=10.0)
 
 
 def test_arrays_of_unequal_length_are_listed(save: Save) -> None:
     with pytest.raises(InputError, match=r"arrays differ in length \(tip 50, piezo 49 samples\)"):
-        open_npz(save(t=t(), tip=t(), piezo=t(49)), plant())
+        open_foreign(save(t=t(), tip=t(), piezo=t(49)), plant())
 
 
 @pytest.mark.parametrize(
@@ -513,7 +519,7 @@ def test_sidecars_that_cannot_be_used(save: Save, tmp_path: Path, name: str, con
     path = save(t=t(), tip=t(), piezo=t())
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=why):
-        open_npz(path, plant())
+        open_foreign(path, plant())
 
 
 def test_sidecar_given_must_exist_and_is_the_only_one_read(save: Save, tmp_path: Path) -> None:
@@ -521,11 +527,11 @@ def test_sidecar_given_must_exist_and_is_the_only_one_read(save: Save, tmp_path:
     (tmp_path / "run.json").write_text("not JSON")
     other = tmp_path / "other.JSON"
     with pytest.raises(InputError, match=r"other\.JSON: cannot be read"):
-        open_npz(path, plant(), sidecar=other)
+        open_foreign(path, plant(), sidecar=other)
     other.write_text('{"fs_hz": 25.0}')
-    assert open_npz(path, plant(), sidecar=other).sample_rate_hz == 25.0
+    assert open_foreign(path, plant(), sidecar=other).sample_rate_hz == 25.0
     with pytest.raises(InputError, match=r"other\.toml: cannot be read"):
-        open_npz(path, plant(), sidecar=tmp_path / "other.toml")
+        open_foreign(path, plant(), sidecar=tmp_path / "other.toml")
 
 
 def _archive() -> tuple[bytes, np.ndarray]:
@@ -548,7 +554,7 @@ def test_damaged_files_are_refused_or_read_right(tmp_path: Path, data: st.DataOb
     path = tmp_path / "damaged.npz"
     path.write_bytes(bytes(damaged[:cut]))
     try:
-        read = open_npz(path, plant()).values[:, 0]
+        read = open_foreign(path, plant()).values[:, 0]
     except InputError:
         return
     np.testing.assert_array_equal(read, TIP)
@@ -569,7 +575,7 @@ def test_nonsense_in_an_arrays_header_is_refused_even_with_a_right_checksum(
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("tip.npy", bytes(member))
     try:
-        blocks = list(open_npz(path, plant()).blocks())
+        blocks = list(open_foreign(path, plant()).blocks())
     except InputError:
         return
     assert all(np.isfinite(b.values).all() for b in blocks)
@@ -580,7 +586,7 @@ def test_nonsense_in_an_arrays_header_is_refused_even_with_a_right_checksum(
 
 def test_beam_recording_needs_nothing_but_the_plant(realdata: Path) -> None:
     path = realdata / "beam_closed_lq.npz"
-    recording = open_npz(path, load_plant("beam"))
+    recording = open_foreign(path, load_plant("beam"))
     assert [str(m) for m in recording.mapping] == [
         "tip_displacement <- y [mm -> m, x 0.001]: the plant's recorded_as",
         "piezo <- u [V -> V, x 1]: the plant's recorded_as",
@@ -593,7 +599,7 @@ def test_beam_recording_needs_nothing_but_the_plant(realdata: Path) -> None:
 
 
 def test_beam_recording_by_equal_names_takes_units_from_beside_it(realdata: Path) -> None:
-    recording = open_npz(realdata / "beam_closed_lq.npz", plant("y", "u"))
+    recording = open_foreign(realdata / "beam_closed_lq.npz", plant("y", "u"))
     assert [(m.array, m.unit, m.decided) for m in recording.mapping] == [
         ("y", "mm", "equal names; unit from beam_closed_lq.json"),
         ("u", "V", "equal names; unit from beam_closed_lq.json"),
@@ -603,21 +609,23 @@ def test_beam_recording_by_equal_names_takes_units_from_beside_it(realdata: Path
 def test_beam_recording_by_guess(realdata: Path) -> None:
     path = realdata / "beam_closed_lq.npz"
     assert (
-        open_npz(path, plant("tip", "u")).mapping[0].decided.startswith("guessed: the only array left in mm")
+        open_foreign(path, plant("tip", "u"))
+        .mapping[0]
+        .decided.startswith("guessed: the only array left in mm")
     )
     with pytest.raises(InputError, match=r"'piezo' \[V\] \(could be u or V1 or V2\)"):
-        open_npz(path, plant("y", "piezo"))
+        open_foreign(path, plant("y", "piezo"))
 
 
 def test_uncontrolled_beam_has_no_voltage_and_says_how_to_go_on(realdata: Path) -> None:
     path = realdata / "beam_open.npz"
     with pytest.raises(InputError, match="--channel piezo=none if it was not recorded"):
-        open_npz(path, load_plant("beam"))
-    assert open_npz(path, load_plant("beam"), channels={"piezo": "none"}).n_samples == 11200
+        open_foreign(path, load_plant("beam"))
+    assert open_foreign(path, load_plant("beam"), channels={"piezo": "none"}).n_samples == 11200
 
 
 def test_rounded_repeating_stamps_of_the_fatigue_rig(realdata: Path) -> None:
-    recording = open_npz(realdata / "faster.npz", plant("d", "u"))
+    recording = open_foreign(realdata / "faster.npz", plant("d", "u"))
     rate, note = rate_of(recording)
     assert rate == 128.0
     assert "time array 't' is not evenly spaced (steps of 0 to 11 ms, median 8 ms), so it is not used" in note
@@ -625,7 +633,7 @@ def test_rounded_repeating_stamps_of_the_fatigue_rig(realdata: Path) -> None:
 
 def test_damper_columns_are_reached_by_index(realdata: Path) -> None:
     options = {"tip": "e1_1[:,0]:mm", "piezo": "none"}
-    recording = open_npz(realdata / "mr_0V.npz", plant(), channels=options)
+    recording = open_foreign(realdata / "mr_0V.npz", plant(), channels=options)
     assert (recording.n_samples, recording.sample_rate_hz) == (3001, 100.0)
 
 
@@ -638,14 +646,14 @@ def test_circuit_records_are_reached_by_index(realdata: Path) -> None:
             '[[sensor]]\nname = "capacitor"\nkind = "voltage"\nof = "coil"\nnoise_density = 1e-6\n'
         )
     )
-    recording = open_npz(realdata / "rlc_20221130_0001.npz", coil, channels=options | {"coil": "none"})
+    recording = open_foreign(realdata / "rlc_20221130_0001.npz", coil, channels=options | {"coil": "none"})
     assert recording.values.shape == (4464, 2)
     assert recording.sample_rate_hz == pytest.approx(892857.18, rel=1e-6)
 
 
 def test_response_functions_are_no_recording(realdata: Path) -> None:
     with pytest.raises(InputError, match="holds complex128, not real numbers"):
-        open_npz(
+        open_foreign(
             realdata / "soton_frf_in1.npz",
             plant(),
             channels={"tip": "H[:,0]", "piezo": "none"},
