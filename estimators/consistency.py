@@ -13,120 +13,151 @@ import numpy as np
 from scipy.special import gammainccinv, gammaincinv, ndtri
 
 from estimators.types import StateEstimate
+from twin.plant.compiled import kernel
 from twin.plant.linear import Array
 
-CAPS = (4.0, 0.75, 1.0)
-"""No block adds more than this NIS, mean and autocorrelation to the memory: a fault is forgotten in three time
-constants."""
+NIS, BIAS, LAG1 = 0, 1, 2
+"""Rows of the statistics: mean square, mean, autocorrelation from one sample to the next."""
+
+CAPS = np.array([4.0, 0.75, 1.0])
+"""No block adds more than this to the memory: a fault is forgotten within three of its time constants."""
 
 
 class Statistics(NamedTuple):
-    """Per sensor: independent samples for squares and for means, pairs, and the three statistics."""
+    """Three statistics of each sensor's normalised innovations, in the rows NIS, BIAS and LAG1.
 
-    squares: Array
-    means: Array
-    pairs: Array
-    nis: Array
-    bias: Array
-    lag1: Array
+    Attributes
+    ----------
+    count
+        (3, p) number of independent samples that would be as certain; 0 where nothing was measured.
+    value
+        (3, p); NaN where there is none.
+    """
+
+    count: Array
+    value: Array
 
 
 class FadingStatistics:
-    """Statistics with exponentially fading weights; what one block adds is capped, so that a fault is forgotten."""
+    """Statistics with exponentially fading weights.
+
+    Parameters
+    ----------
+    sensors
+        How many.
+    """
 
     def __init__(self, sensors: int) -> None:
-        self._weight, self._weight2 = np.zeros((3, sensors)), np.zeros((3, sensors))
-        self._sum = np.zeros((3, sensors))
+        self._sums = np.zeros((3, 3, sensors))  # weights, squared weights, weighted values
 
     def add(self, s: Statistics, fade: float) -> None:
-        """Take one block in."""
-        n = np.vstack([s.squares, s.means, s.pairs])
-        value = np.vstack([s.nis, s.bias, s.lag1])
-        n = np.where(np.isfinite(value), n, 0.0)
-        caps = np.array(CAPS)[:, None]
-        self._weight = fade * self._weight + n
-        self._weight2 = fade**2 * self._weight2 + n
-        self._sum = fade * self._sum + n * np.clip(np.nan_to_num(value), -caps, caps)
+        """Take one block in, after the older ones' weight has faded by a factor."""
+        fade_in(s.count, s.value, fade, CAPS, self._sums)
 
     def statistics(self) -> Statistics:
         """Weighted means, and the number of equally weighted samples that would be as certain."""
-        some = self._weight > 0.0
-        blank = np.full_like(self._sum, np.nan)
-        value = np.divide(self._sum, self._weight, out=blank, where=some)
-        n = np.divide(self._weight**2, self._weight2, out=np.zeros_like(self._sum), where=some)
-        return Statistics(n[0], n[1], n[2], value[0], value[1], value[2])
+        count, value = np.empty(self._sums.shape[1:]), np.empty(self._sums.shape[1:])
+        take_out(self._sums, count, value)
+        return Statistics(count, value)
 
 
 def statistics_of(estimate: StateEstimate) -> Statistics:
     """Statistics of one block."""
-    count = np.asarray(estimate.innovation_count, dtype=np.float64)
-    lag1 = estimate.innovation_lag1
-    with np.errstate(invalid="ignore", divide="ignore"):
-        bias = estimate.innovation_mean / estimate.innovation_std
-    return Statistics(
-        squares=independent_samples(count, lag1, squares=True),
-        means=independent_samples(count, lag1, squares=False),
-        pairs=np.maximum(count - 1.0, 0.0),
-        nis=estimate.nis_per_sensor,
-        bias=bias,
-        lag1=lag1,
+    shape = (3, len(estimate.sensors))
+    count, value = np.empty(shape), np.empty(shape)
+    gather(
+        estimate.innovation_count,
+        estimate.nis_per_sensor,
+        estimate.innovation_mean,
+        estimate.innovation_std,
+        estimate.innovation_lag1,
+        count,
+        value,
     )
+    return Statistics(count, value)
 
 
-def independent_samples(count: Array, lag1: Array, *, squares: bool) -> Array:
+@kernel
+def independent_samples(count: float, lag1: float, squares: bool) -> float:
     """How many independent samples are worth as much as correlated ones.
 
     Innovations with autocorrelation ``rho**|k|`` count ``(1 - rho) / (1 + rho)`` of their number for a mean, and with
     rho² for rho when their squares are averaged (Bartlett 1946). Correlation within 0.1 is taken as none, beyond 0.5 as
-    0.5: there it is itself the finding.
-
-    Parameters
-    ----------
-    count, lag1
-        (n,) samples and their autocorrelation; NaN as none.
-    squares
-        Whether their squares are averaged.
+    0.5: there it is itself the finding. NaN is none.
     """
-    rho = np.nan_to_num(lag1)
-    rho = np.where(np.abs(rho) < 0.1, 0.0, np.clip(rho, -0.5, 0.5))
-    rho = rho**2 if squares else np.maximum(rho, 0.0)
-    return np.asarray(count * (1.0 - rho) / (1.0 + rho))
+    rho = 0.0
+    if abs(lag1) >= 0.1:
+        rho = min(max(lag1, -0.5), 0.5)
+    rho = rho * rho if squares else max(rho, 0.0)
+    return count * (1.0 - rho) / (1.0 + rho)
+
+
+@kernel
+def gather(
+    samples: Array, nis: Array, mean: Array, std: Array, lag1: Array, count: Array, value: Array
+) -> None:
+    """Fill (3, p) counts and statistics from those of a `StateEstimate`, each (p,)."""
+    for r in range(len(samples)):
+        count[NIS, r] = independent_samples(samples[r], lag1[r], True)
+        count[BIAS, r] = independent_samples(samples[r], lag1[r], False)
+        count[LAG1, r] = max(samples[r] - 1.0, 0.0)
+        value[NIS, r], value[LAG1, r] = nis[r], lag1[r]
+        value[BIAS, r] = mean[r] / std[r] if std[r] > 0.0 else np.nan
+        for k in range(3):
+            if not np.isfinite(value[k, r]):
+                count[k, r], value[k, r] = 0.0, np.nan
+
+
+@kernel
+def fade_in(count: Array, value: Array, fade: float, caps: Array, sums: Array) -> None:
+    """Fade (3, 3, p) sums of weights, squared weights and weighted values, and add capped statistics to them."""
+    for k in range(count.shape[0]):
+        for r in range(count.shape[1]):
+            n = count[k, r]
+            capped = min(max(value[k, r], -caps[k]), caps[k]) if n > 0.0 else 0.0
+            sums[0, k, r] = fade * sums[0, k, r] + n
+            sums[1, k, r] = fade * fade * sums[1, k, r] + n
+            sums[2, k, r] = fade * sums[2, k, r] + n * capped
+
+
+@kernel
+def take_out(sums: Array, count: Array, value: Array) -> None:
+    """Counts and statistics, (3, p), that (3, 3, p) sums stand for."""
+    for k in range(count.shape[0]):
+        for r in range(count.shape[1]):
+            # Weights below one sample are the remains of what was measured long ago.
+            some = sums[0, k, r] > 1.0
+            count[k, r] = sums[0, k, r] ** 2 / sums[1, k, r] if some else 0.0
+            value[k, r] = sums[2, k, r] / sums[0, k, r] if some else np.nan
 
 
 def nis_band(count: float, level: float) -> tuple[float, float]:
     """Band that the mean of ``count`` normalised squares leaves with probability ``level``, half on either side.
 
-    ``chi2(count) / count``; (NaN, NaN) without any.
+    ``chi2(count) / count``, with large counts rounded to three digits; (NaN, NaN) without any.
     """
     if not count > 0.0:
         return math.nan, math.nan
-    return _chi2_band(count if count < 100.0 else float(round(count)), level)
+    return _chi2_band(count if count < 100.0 else round(count, 2 - math.floor(math.log10(count))), level)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=4096)
 def _chi2_band(count: float, level: float) -> tuple[float, float]:
     half = 0.5 * count
     return float(gammaincinv(half, 0.5 * level)) / half, float(gammainccinv(half, 0.5 * level)) / half
 
 
-def nis_bands(count: Array, level: float) -> tuple[Array, Array]:
-    """Lower and upper ends of `nis_band`, for each of some counts."""
-    bands = np.array([nis_band(float(n), level) for n in count])
-    return bands[:, 0], bands[:, 1]
-
-
-def bias_band(count: Array | float, level: float) -> Array:
+def bias_band(count: float, level: float) -> float:
     """Magnitude that the mean of ``count`` normalised innovations passes with probability ``level``."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(_normal(level) / np.sqrt(count))
+    return _normal(level) / math.sqrt(count) if count > 0.0 else math.inf
 
 
-def whiteness_band(count: Array | float, level: float) -> Array:
+def whiteness_band(count: float, level: float) -> float:
     """Magnitude that the lag-one autocorrelation of ``count`` pairs passes with probability ``level``.
 
     By Fisher's z-transformation, so that it stays below 1; 1 for fewer than four pairs, which tell nothing.
     """
-    return np.asarray(np.tanh(_normal(level) / np.sqrt(np.maximum(np.asarray(count) - 3.0, 1e-9))))
+    return math.tanh(_normal(level) / math.sqrt(count - 3.0)) if count > 3.0 else 1.0
 
 
 @lru_cache(maxsize=16)

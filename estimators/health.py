@@ -17,11 +17,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from estimators.consistency import (
+    BIAS,
+    LAG1,
+    NIS,
     FadingStatistics,
     Statistics,
     bias_band,
     nis_band,
-    nis_bands,
     statistics_of,
     whiteness_band,
 )
@@ -30,12 +32,19 @@ from estimators.observer import Observer
 from estimators.signal_check import Finding
 from estimators.types import StateEstimate
 from twin.plant.blocks import Block, Channel
+from twin.plant.linear import Array
+
+ALL_CHANNELS = "all channels"
+"""Named where a block brought nothing."""
 
 Verdict = Literal["consistent", "drifting", "diverged", "no data"]
 HealthTest = Literal["", "signal", "bias", "noise", "nis", "whiteness"]
 
 BAND_LEVEL = 0.05
 """Outside of the band that people see a consistent filter is this often."""
+
+LIKELY = 0.8
+"""Cosine between pattern and signature from which on an offset, which may be on the move, is a sensor's."""
 
 VERDICT_LEVEL = 1e-7
 """Beyond the tolerated by chance a statistic is at most this often; of 24 looks per block of 0.1 s, once in 12 h."""
@@ -65,7 +74,7 @@ class HealthSettings:
     """
 
     nis: tuple[float, float] = (0.6, 1.25)
-    nis_diverged: float = 1.75
+    nis_diverged: float = 1.5
     bias: float = 0.02
     bias_diverged: float = 0.5
     whiteness: float = 0.1
@@ -123,11 +132,6 @@ class _Masked(NamedTuple):
 _CONSISTENT = _Cause(0, "", "", "")
 _VERDICTS: tuple[Verdict, ...] = ("consistent", "drifting", "no data", "diverged")
 _DRIFTING, _NO_DATA, _DIVERGED = 1, 2, 3
-_CAPS = (
-    4.0,
-    0.75,
-    1.0,
-)  # what one block can add to the memory: a fault is forgotten within three time constants
 
 
 class HealthMonitor:
@@ -150,6 +154,8 @@ class HealthMonitor:
         self._verdict: Verdict = "consistent"
         self._since = 0
         self._cause = _CONSISTENT
+        self._rival = ""
+        self._worst_until = 0
 
     def advance(
         self,
@@ -177,116 +183,148 @@ class HealthMonitor:
         now = statistics_of(estimate)
         if self._memory is None:
             self._memory = FadingStatistics(len(estimate.sensors))
-        self._memory.add(now, math.exp(-elapsed_s / self.settings.memory_s))
+        if signal.severity < _NO_DATA:  # what a lost signal does to the others is no news
+            self._memory.add(now, math.exp(-elapsed_s / self.settings.memory_s))
         fading = self._memory.statistics()
-        severity = max(self._severity(now), self._severity(fading))
-        cause = _CONSISTENT
-        if severity:
-            statistics = now if self._severity(now) else fading
-            # While only the memory still knows of it, what was said first stands.
-            known = statistics is fading and self._cause.test not in ("", "signal")
-            cause = self._cause if known else self._name(statistics, estimate, observer, frequency_hz)
-            cause = cause._replace(severity=severity)
-        # A masked signal explains what the innovations show besides; the worse of both decides how bad it is.
+        of_now = self._severity(now)
+        of_memory = self._severity(fading)
         if signal.severity:
-            cause = signal._replace(severity=max(signal.severity, min(severity, _DIVERGED)))
+            # A masked signal explains what the innovations show besides; the worse of both says how bad it is.
+            cause = signal._replace(severity=max(signal.severity, of_now))
+        elif of_now or (of_memory and not self._cause.severity):
+            statistics = now if of_now else fading
+            cause = self._name(statistics, estimate, observer, frequency_hz)
+            cause = self._steady(cause._replace(severity=max(of_now, of_memory)))
+        elif of_memory:
+            # While only the memory still knows of it, what was said first stands.
+            cause = self._cause._replace(severity=of_memory)
+        else:
+            cause = _CONSISTENT
+        cause = self._held(cause, block)
         verdict = _VERDICTS[cause.severity]
         if verdict != self._verdict:
             self._verdict, self._since = verdict, block.first_sample
         self._cause = cause
         return self._health(estimate, now, cause)
 
+    def _steady(self, cause: _Cause) -> _Cause:
+        """Keep to the channel named first until another one is worse in two blocks running."""
+        known, rival = self._cause, self._rival
+        self._rival = cause.channel
+        if known.severity and known.test != "signal" and cause.channel not in (known.channel, rival):
+            return known._replace(severity=cause.severity)
+        return cause
+
+    def _held(self, cause: _Cause, block: Block) -> _Cause:
+        """Let a verdict become better only after it has been so for a while."""
+        if cause.severity >= self._cause.severity:
+            self._worst_until = block.end_sample + round(self.settings.hold_s * block.sample_rate_hz)
+        elif block.end_sample < self._worst_until:
+            return self._cause
+        else:
+            self._worst_until = block.end_sample + round(self.settings.hold_s * block.sample_rate_hz)
+        return cause
+
     def _health(self, estimate: StateEstimate, now: Statistics, cause: _Cause) -> Health:
-        seen = now.squares > 0.0
         bias = whiteness = math.nan
-        if seen.any():
+        if now.count[NIS].any():
             if cause.channel in estimate.sensors:
                 worst = estimate.sensors.index(cause.channel)
             else:
-                worst = int(np.nanargmax(np.abs(np.where(seen, now.bias, np.nan) * np.sqrt(now.means))))
-            bias, whiteness = float(now.bias[worst]), float(now.lag1[worst])
+                worst = int(np.argmax(np.nan_to_num(np.abs(now.value[BIAS])) * np.sqrt(now.count[BIAS])))
+            bias, whiteness = float(now.value[BIAS, worst]), float(now.value[LAG1, worst])
         return Health(
             verdict=_VERDICTS[cause.severity],
             channel=cause.channel,
             test=cause.test,
             reason=cause.reason,
             nis=estimate.nis,
-            nis_band=nis_band(float(now.squares.sum()), BAND_LEVEL),
+            nis_band=nis_band(float(now.count[NIS].sum()), BAND_LEVEL),
             bias=bias,
             whiteness=whiteness,
             since_sample=self._since,
         )
 
     def _severity(self, s: Statistics) -> int:
-        """0 to 3 by the worst statistic of any sensor."""
-        settings = self.settings
-        low, high = nis_bands(s.squares, VERDICT_LEVEL)
-        off = bias_band(s.means, VERDICT_LEVEL)
-        with np.errstate(invalid="ignore"):  # NaN, of a sensor that said nothing, is beyond no bound
-            if (s.nis > settings.nis_diverged * high).any() or (
-                np.abs(s.bias) > settings.bias_diverged + off
-            ).any():
+        """0 to 3 by the worst statistic of any sensor; NaN, of a sensor that said nothing, is beyond no bound."""
+        settings, severity = self.settings, 0
+        for counts, values in zip(s.count.T.tolist(), s.value.T.tolist(), strict=True):
+            low, high = nis_band(counts[NIS], VERDICT_LEVEL)
+            nis, off, colour = values[NIS], abs(values[BIAS]), abs(values[LAG1])
+            chance = bias_band(counts[BIAS], VERDICT_LEVEL)
+            if nis > settings.nis_diverged * high or off > settings.bias_diverged + chance:
                 return _DIVERGED
-            coloured = np.abs(s.lag1) > settings.whiteness + whiteness_band(s.pairs, VERDICT_LEVEL)
-            outside = (s.nis > settings.nis[1] * high) | (s.nis < settings.nis[0] * low) | coloured
-            return _DRIFTING if (outside | (np.abs(s.bias) > settings.bias + off)).any() else 0
+            if (
+                nis > settings.nis[1] * high
+                or nis < settings.nis[0] * low
+                or off > settings.bias + chance
+                or colour > settings.whiteness + whiteness_band(counts[LAG1], VERDICT_LEVEL)
+            ):
+                severity = _DRIFTING
+        return severity
 
     def _name(
         self, s: Statistics, estimate: StateEstimate, observer: Observer, frequency_hz: float
     ) -> _Cause:
         """Find the test and the channel that says most, and put it in words."""
-        settings, names = self.settings, estimate.sensors
-        mean, nis = np.nan_to_num(s.bias), np.where(np.isfinite(s.nis), s.nis, 1.0)
-        lag1 = np.nan_to_num(s.lag1)
-        excess = nis - 1.0 - mean**2
-        low, high = nis_bands(s.squares, VERDICT_LEVEL)
-        off = bias_band(s.means, VERDICT_LEVEL)
-        beyond_bias = np.nan_to_num((np.abs(mean) - settings.bias) / off)
-        over = nis > settings.nis[1] * high
-        if beyond_bias.max() > 1.0 and (
-            not over.any() or (mean**2).sum() > 0.5 * np.maximum(excess, 0.0).sum()
-        ):
-            found = suspect_of_offset(mean, innovation_signatures(observer, 0.0))
-            worst = int(np.argmax(beyond_bias))
-            if found.likeness >= ALIKE:
-                std = math.sqrt(float(np.asarray(observer.filter.R)[found.sensor, found.sensor]))
-                name = names[found.sensor]
-                size = f"{found.error * std:+.2g} {self._units.get(name, '')}"
-                text = f"{name} has an offset of about {size}: check its zero, its supply and its mounting"
-                return _Cause(0, name, "bias", text)
-            text = (
-                f"{names[worst]} is off its prediction by {mean[worst]:+.2g} standard deviations on average"
-            )
-            return _Cause(0, names[worst], "bias", f"{text}: an offset, or a steady force the model lacks")
+        nis = np.where(np.isfinite(s.value[NIS]), s.value[NIS], 1.0)
+        mean, lag1 = np.nan_to_num(s.value[BIAS]), np.nan_to_num(s.value[LAG1])
+        bands = np.array([nis_band(n, VERDICT_LEVEL) for n in s.count[NIS].tolist()])
+        low, high = np.nan_to_num(bands[:, 0]), np.where(s.count[NIS] > 0.0, bands[:, 1], np.inf)
+        chance = np.array([bias_band(n, VERDICT_LEVEL) for n in s.count[BIAS].tolist()])
+        excess = np.maximum(nis - 1.0 - mean**2, 0.0)
+        biased = (np.abs(mean) - self.settings.bias) / chance
+        over = nis > self.settings.nis[1] * high
+        if biased.max() > 1.0 and (not over.any() or np.sum(mean**2) > 0.5 * np.sum(excess)):
+            return self._name_bias(mean, int(np.argmax(biased)), estimate, observer)
         if over.any():
-            worst = int(np.argmax(nis / high))
-            if abs(lag1[worst]) < 0.25 and nis[worst] - 1.0 > 2.0 * np.sum(
-                np.delete(np.maximum(excess, 0.0), worst)
-            ):
-                text = f"{names[worst]} is noisier than stated by a factor of {math.sqrt(nis[worst]):.2g}"
-                return _Cause(
-                    0, names[worst], "noise", f"{text}: check cable and connector, or its noise_density"
-                )
-            found = suspect_of_excess(excess, innovation_signatures(observer, frequency_hz))
-            if found.likeness >= ALIKE:
-                name = names[found.sensor]
-                text = f"model and {name} disagree at the excitation (NIS {nis[found.sensor]:.3g})"
-                return _Cause(
-                    0,
-                    name,
-                    "nis",
-                    f"{text}: check its gain and alignment, then the model of what it measures",
-                )
-            text = f"the model disagrees with the rig, most in {names[worst]} (NIS {nis[worst]:.3g})"
-            return _Cause(0, names[worst], "nis", f"{text}: check masses, stiffnesses and coil constants")
-        colour = np.abs(lag1) - settings.whiteness
-        under = nis < settings.nis[0] * low
-        worst = int(np.argmin(np.where(under, nis / low, np.inf) if under.any() else -colour))
+            return self._name_excess(
+                nis, excess, lag1, int(np.argmax(nis / high)), estimate, observer, frequency_hz
+            )
+        under = nis < self.settings.nis[0] * low
         if under.any():
-            text = f"{names[worst]} is quieter than stated (NIS {nis[worst]:.2g})"
-            return _Cause(0, names[worst], "noise", f"{text}: its noise_density is too large, or it is dead")
-        text = f"innovations of {names[worst]} are coloured (lag-1 autocorrelation {lag1[worst]:+.2f})"
-        return _Cause(0, names[worst], "whiteness", f"{text}: dynamics the model lacks, or filtered noise")
+            worst = int(np.argmin(np.where(under, nis, np.inf)))
+            name = estimate.sensors[worst]
+            text = f"{name} is quieter than stated (NIS {nis[worst]:.2g})"
+            return _Cause(0, name, "noise", f"{text}: its noise_density is too large, or it is dead")
+        worst = int(np.argmax(np.abs(lag1)))
+        name = estimate.sensors[worst]
+        text = f"innovations of {name} are coloured (lag-1 autocorrelation {lag1[worst]:+.2f})"
+        return _Cause(0, name, "whiteness", f"{text}: dynamics the model lacks, or filtered noise")
+
+    def _name_bias(self, mean: Array, worst: int, estimate: StateEstimate, observer: Observer) -> _Cause:
+        found = suspect_of_offset(mean, innovation_signatures(observer, 0.0))
+        if found.likeness < LIKELY:
+            name = estimate.sensors[worst]
+            text = f"{name} is off its prediction by {mean[worst]:+.2g} standard deviations on average"
+            return _Cause(0, name, "bias", f"{text}: an offset, or a steady force the model lacks")
+        name = estimate.sensors[found.sensor]
+        std = math.sqrt(float(np.asarray(observer.filter.R)[found.sensor, found.sensor]))
+        size = f"{found.error * std:+.2g} {self._units.get(name, '')}"
+        text = f"{name} has an offset of about {size}"
+        return _Cause(0, name, "bias", f"{text}: check its zero, its supply and its mounting")
+
+    def _name_excess(
+        self,
+        nis: Array,
+        excess: Array,
+        lag1: Array,
+        worst: int,
+        estimate: StateEstimate,
+        observer: Observer,
+        frequency_hz: float,
+    ) -> _Cause:
+        name = estimate.sensors[worst]
+        if abs(lag1[worst]) < 0.25 and nis[worst] - 1.0 > 2.0 * np.sum(np.delete(excess, worst)):
+            text = f"{name} is noisier than stated by a factor of {math.sqrt(nis[worst]):.2g}"
+            return _Cause(0, name, "noise", f"{text}: check cable and connector, or its noise_density")
+        found = suspect_of_excess(excess, innovation_signatures(observer, frequency_hz))
+        if found.likeness >= ALIKE:
+            name = estimate.sensors[found.sensor]
+            text = f"model and {name} disagree at the excitation (NIS {nis[found.sensor]:.3g})"
+            return _Cause(0, name, "nis", f"{text}: check its gain, then the model of what it measures")
+        text = f"the model disagrees with the rig, most in {name} (NIS {nis[worst]:.3g})"
+        return _Cause(0, name, "nis", f"{text}: check masses, stiffnesses and coil constants")
 
     def _judge_signals(
         self, block: Block, estimate: StateEstimate, findings: Sequence[Finding], elapsed_s: float
@@ -307,12 +345,10 @@ class HealthMonitor:
                 or cause.severity >= self._masked[cause.channel].cause.severity
             ):
                 self._masked[cause.channel] = _Masked(cause, until)
-        self._masked = {n: m for n, m in self._masked.items() if m.until_sample > block.first_sample}
-        lost = float(estimate.innovation_count.sum()) == 0.0
-        if lost and block.n_samples:
-            names = [n for n in estimate.sensors if n in self._masked]
+        if block.n_samples and float(estimate.innovation_count.sum()) == 0.0:
             text = "no valid sample of any sensor in the block: check the connection to the rig"
-            return _Cause(_NO_DATA, ", ".join(names or estimate.sensors), "signal", text)
+            self._masked = {ALL_CHANNELS: _Masked(_Cause(_NO_DATA, ALL_CHANNELS, "signal", text), until)}
+        self._masked = {n: m for n, m in self._masked.items() if m.until_sample > block.first_sample}
         causes = [m.cause for m in self._masked.values()]
         return max(causes, key=lambda c: c.severity) if causes else _CONSISTENT
 

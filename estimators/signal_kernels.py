@@ -153,12 +153,22 @@ def trailing_runs(values: Array, run_length: NDArray[np.int64], same: NDArray[np
 
 
 @kernel
-def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint8]) -> None:
-    """Mark by 4 what lies off the median of five by more than the bound, and by more than its neighbours spread.
+def insert(sorted_: Array, count: int, value: float) -> None:
+    """Insert a value among the first ``count`` of an ascending array."""
+    while count > 0 and sorted_[count - 1] > value:
+        sorted_[count] = sorted_[count - 1]
+        count -= 1
+    sorted_[count] = value
 
-    The median leaves steps and one or two neighbouring spikes where they are; the neighbours' spread keeps the
-    crests of an oscillation sampled a few times per period from passing for spikes (Hampel's filter with a
-    guard). The block's last two samples are judged with those before them.
+
+@kernel
+def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint8]) -> None:
+    """Mark by 4 what lies off the median of five by more than the bound, and by more than three of them spread.
+
+    Steps and one or two spikes among five leave the median where it is; the five are freed of their slope first. The
+    spread of those three that lie closest together keeps the crests of an oscillation sampled a few times per period
+    from passing for spikes (Hampel's filter with a guard). The block's last two samples are judged with those before
+    them.
 
     Parameters
     ----------
@@ -166,7 +176,7 @@ def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint
         (4,) samples before the block; NaN where there are none.
     """
     n = len(signal)
-    window, sorted_ = np.empty(5), np.empty(5)
+    window, level, steps = np.empty(5), np.empty(5), np.empty(4)
     for k in range(n):
         if kinds[k] != 0:
             continue
@@ -184,13 +194,14 @@ def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint
                 complete = False
         if not complete:
             continue
+        # A spike spoils two of the four differences, the same way at most if there are two of it: of the middle ones
+        # the smaller is sound.
+        for j in range(4):
+            insert(steps, j, window[j + 1] - window[j])
+        slope = steps[1] if abs(steps[1]) < abs(steps[2]) else steps[2]
         for j in range(5):
-            value = window[j]
-            i = j
-            while i > 0 and sorted_[i - 1] > value:
-                sorted_[i] = sorted_[i - 1]
-                i -= 1
-            sorted_[i] = value
-        off = abs(signal[k] - sorted_[2])
-        if off > bound and off > 3.0 * (sorted_[3] - sorted_[1]):
+            insert(level, j, window[j] - slope * (j - 2))
+        off = abs(signal[k] - slope * (k - start - 2) - level[2])
+        spread = min(level[2] - level[0], level[3] - level[1], level[4] - level[2])
+        if off > bound and off > 3.0 * spread:
             kinds[k] = 4
