@@ -1,8 +1,8 @@
 """A schedule as a rig's firmware holds it: predicted figures per point, fixed-point tables, and what rounding costs.
 
 A fixed-point column is whole numbers with one power of two, ``value = number * 2**exponent``, so that firmware scales
-by shifting. Cutoffs are stored as what the filters compute with, ``g = tan(pi f_c/f_s)`` (`twin.control.chain`): a target
-without floating point has no tangent. The tables are rounded, the filters' own arithmetic is the firmware's business.
+by shifting. Cutoffs are stored as what the filters compute with, ``g = tan(pi f_c/f_s)`` (`twin.control.chain`): a
+target without floating point has no tangent. The tables are rounded; the filters' own arithmetic is the firmware's.
 """
 
 import math

@@ -65,6 +65,29 @@ class PatternName(StrEnum):
     TONE = "tone"
 
 
+class RuleName(StrEnum):
+    """Rules that ``atmd export`` makes a schedule by."""
+
+    THESIS = "thesis"
+
+
+class FixedPointName(StrEnum):
+    """Fixed-point formats of ``atmd export``; auto is the shortest that keeps the margins."""
+
+    AUTO = "auto"
+    Q15 = "Q15"
+    Q31 = "Q31"
+    NONE = "none"
+
+
+class BudgetName(StrEnum):
+    """Powers that a budget may bound."""
+
+    JOULE_MEAN = "joule_mean"
+    JOULE_PEAK = "joule_peak"
+    ELECTRICAL = "electrical"
+
+
 class Interrupted(BaseException):
     """The person pressed Ctrl-C. Its own kind: the command-line library ends silently on KeyboardInterrupt."""
 
@@ -370,6 +393,85 @@ def rig(
     say(f"rig '{programme.plant.name}' ({programme.plant.fingerprint}): {programme.sweep.description}")
     say(f"samples on tcp://{bind}:{server.samples_port}, commands on tcp://{bind}:{server.commands_port}")
     server.run()
+
+
+@app.command(
+    epilog="Examples: atmd export runs/demo.rrd --out firmware   ·   "
+    "atmd export tuning.json --plant rig --out firmware   ·   atmd export --plant rig --rule thesis --out firmware"
+)
+def export(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for PLANT_schedule.json and .h.", show_default=False)
+    ],
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="Recording (.rrd), or .json of atmd tune or of an earlier export."),
+    ] = None,
+    plant: Annotated[
+        str | None, typer.Option(metavar="PRESET|FILE", help="Plant; a recording carries its own.")
+    ] = None,
+    rule: Annotated[
+        RuleName | None, typer.Option(help="Make the schedule by a rule, in place of a FILE.")
+    ] = None,
+    band: Annotated[
+        str, typer.Option(metavar="FROM:TO:STEP", help="Rows of the rule's table in Hz.")
+    ] = "45:55:0.5",
+    fixed_point: Annotated[
+        FixedPointName,
+        typer.Option(help="Words of the rounded tables; auto takes the shortest that will do."),
+    ] = FixedPointName.AUTO,
+    margin_loss: Annotated[
+        float, typer.Option(metavar="PERCENT", help="Share of a margin that rounding may cost.")
+    ] = 5.0,
+    budget_w: Annotated[
+        float | None, typer.Option(metavar="W", help="Power budget, unless the source states one.")
+    ] = None,
+    budget: Annotated[
+        BudgetName | None, typer.Option(help="Which power the budget bounds; joule_mean unless given.")
+    ] = None,
+    excitation: Annotated[
+        float | None,
+        typer.Option(metavar="PEAK", help="Excitation in its actuator's unit, unless the source says."),
+    ] = None,
+    delay_us: Annotated[
+        float | None,
+        typer.Option(
+            metavar="US", help="Delay from measuring to the converter in µs, unless the source says."
+        ),
+    ] = None,
+    made: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Written into both files, such as a date.")
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Write the accepted schedule for the rig's firmware: JSON, and a C header in double and fixed point.
+
+    Everything is verified again on the full model first, filters and delay included: a schedule that is not stable, or
+    whose rounding costs more of a margin than may be lost, is not written. From a recording comes the last schedule
+    the rig took, with the damping learned. JSON keys: plant, fingerprint, damping_ns_m, source, made, budget,
+    excitation, loop, coil, points (per row: displacements passive, limit and reached, stroke, current, three powers,
+    modulus and delay margin, slowest pole), transition (fastest sweep shown to be stable, null is any), fixed_point,
+    rounding (margins before and after), files.
+    """
+    from twin.station.export import export_table, run_export
+    from twin.station.export_source import ExportOptions
+
+    must_be_writable(json_to)
+    options = ExportOptions(
+        out=out,
+        file=file,
+        plant=plant,
+        rule=None if rule is None else rule.value,
+        band=band,
+        fixed_point=fixed_point.value,
+        most_lost_percent=margin_loss,
+        budget_w=budget_w,
+        budget_kind=None if budget is None else budget.value,
+        excitation=excitation,
+        delay_us=delay_us,
+        made=made,
+    )
+    report(run_export(options, say), export_table, json_to)
 
 
 @app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")
