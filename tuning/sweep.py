@@ -117,7 +117,7 @@ def simulate_sweep(
     samples = max(1, round(BLOCK_S * fs))
     _check(from_hz, to_hz, seconds, excitation_amplitude, fs)
     coil = RigModel(plant, facts, from_hz).coil
-    clamp = _clamp(plant, coil, clamp_a)
+    clamp = current_clamp_a(plant, coil, clamp_a)
     blocks = int(seconds * fs + 1e-6) // samples
     edges = from_hz + (to_hz - from_hz) * np.arange(blocks + 1) * samples / (seconds * fs)
     names = linear_model(plant, frequency_hz=from_hz).states
@@ -140,8 +140,8 @@ def simulate_sweep(
         drive = excitation_amplitude * np.sin(math.tau * (from_hz + sweep * t) * t)
         rig_block(
             d.F, d.B0, d.B1, d.C, d.D, np.zeros(n), x, u_before, chain, line, drive, quiet, noise,
-            np.array([math.inf]), np.ones(1), _packed(schedule.at(low), coil, fs),
-            _packed(schedule.at(high), coil, fs), on, clamp, 1.0 / fs, model.coil_input,
+            np.array([math.inf]), np.ones(1), packed_gains(schedule.at(low), coil, fs),
+            packed_gains(schedule.at(high), coil, fs), on, clamp, 1.0 / fs, model.coil_input,
             model.excitation_input, y, reference, states,
         )  # fmt: skip
         gains = schedule.at(middle)
@@ -185,14 +185,15 @@ def _reached(
     )
 
 
-def _packed(gains: Gains, coil: VoiceCoil, sample_rate_hz: float) -> Array:
-    """Gains and cutoffs in the kernel's units."""
+def packed_gains(gains: Gains, coil: VoiceCoil, sample_rate_hz: float) -> Array:
+    """Gains and cutoffs in the units of `rig_block`, (5,)."""
     k = coil.force_constant_n_a
     low, high = (math.tan(math.pi * f / sample_rate_hz) for f in (gains.low_pass_hz, gains.high_pass_hz))
     return np.array([gains.alpha_kg / k, gains.beta_ns_m / k, gains.gamma_n_m / k, low, high])
 
 
-def _clamp(plant: Plant, coil: VoiceCoil, clamp_a: float | None) -> float:
+def current_clamp_a(plant: Plant, coil: VoiceCoil, clamp_a: float | None = None) -> float:
+    """Largest current reference [A]: the given one, else the plant's limit; InputError if there is neither."""
     key = f"{coil.name}_current_a"
     clamp = plant.limits.get(key) if clamp_a is None else clamp_a
     if clamp is None:
