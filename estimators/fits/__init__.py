@@ -1,0 +1,1 @@
+"""Fits from separate tests: modal parameters, springs and dampers, each with its standard deviation."""
