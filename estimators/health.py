@@ -228,8 +228,9 @@ class HealthMonitor:
     def _health(self, estimate: StateEstimate, now: Statistics, cause: _Cause) -> Health:
         bias = whiteness = math.nan
         if now.count[NIS].any():
-            if cause.channel in estimate.sensors:
-                worst = estimate.sensors.index(cause.channel)
+            named = [k for k, name in enumerate(estimate.sensors) if name == cause.channel]
+            if named and now.count[NIS, named[0]] > 0.0:
+                worst = named[0]
             else:
                 worst = int(np.argmax(np.nan_to_num(np.abs(now.value[BIAS])) * np.sqrt(now.count[BIAS])))
             bias, whiteness = float(now.value[BIAS, worst]), float(now.value[LAG1, worst])
