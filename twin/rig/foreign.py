@@ -22,8 +22,9 @@ from twin.rig.timebase import Gap, Stamps, TimeBase, time_base
 PART_ROWS = 1 << 18
 """Rows read from the file at a time."""
 
-ABSURD = 1e25
-"""Typical values beyond this, or below its inverse, are numbers read in the wrong byte order."""
+ABSURD = 1e12
+ABSURD_SHARE = 0.2
+"""So many values beyond this, or below its inverse: numbers read in the wrong byte order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,10 +293,11 @@ def _look(archive: Archive, column: _Column) -> None:
     rows = column.whole[:10_000] if column.whole is not None else archive.read(entry.ref.array, 0, 10_000)
     start = _si(archive, entry, rows if column.whole is not None else _series(archive, entry, rows))
     sizes = np.abs(start[np.isfinite(start) & (start != 0.0)])
-    if len(sizes) > 10 and not 1.0 / ABSURD < float(np.median(sizes)) < ABSURD:
+    absurd = (sizes > ABSURD) | (sizes < 1.0 / ABSURD)
+    if len(sizes) > 10 and np.mean(absurd) > ABSURD_SHARE:
         raise InputError(
-            f"{archive.path}: array '{entry.ref}' has values of about {np.median(sizes):.1e} {entry.si_unit}: "
-            "written in the other byte order, or damaged; export it again"
+            f"{archive.path}: array '{entry.ref}' has values from {sizes.min():.0e} to {sizes.max():.0e} "
+            f"{entry.si_unit}: written in the other byte order, or damaged; export it again"
         )
 
 

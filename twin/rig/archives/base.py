@@ -1,5 +1,6 @@
 """What every format of measured data is read as: named arrays, each of which can be read in parts."""
 
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -62,6 +63,11 @@ class Archive(ABC):
 
     def close(self) -> None:  # noqa: B027 - most formats hold nothing open
         """Let go of the file."""
+
+    def __del__(self) -> None:
+        """Nobody reads it any more."""
+        with contextlib.suppress(Exception):  # it may not have come so far as to open anything
+            self.close()
 
 
 def guard_memory(path: Path, name: str, n_bytes: int, remedy: str) -> None:

@@ -28,13 +28,14 @@ class TdmsArchive(Archive):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        self._file = path.open("rb")  # ours, so that it is closed whatever the reader makes of it
         try:
-            self._file = TdmsFile.open(path)
-            channels = [c for group in self._file.groups() for c in group.channels()]
+            channels = [c for group in TdmsFile.open(self._file).groups() for c in group.channels()]
             found = [
                 c for c in channels if c.dtype is not None and np.dtype(c.dtype).kind in "fiu" and len(c)
             ]
         except UNREADABLE as error:
+            self._file.close()
             raise InputError(f"{path}: is cut short or damaged ({error}); copy or export it again") from error
         once = [c.name for c in found]
         self._channels: dict[str, TdmsChannel] = {

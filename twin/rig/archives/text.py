@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 from numpy.typing import NDArray
 
@@ -133,9 +134,9 @@ class TextArchive(Archive):
     def _converted(self, batch: pa.RecordBatch) -> pa.RecordBatch:
         columns = []
         for column, name in zip(batch.columns, batch.schema.names, strict=True):
-            trimmed = pa.compute.utf8_trim_whitespace(column)
+            trimmed = pc.utf8_trim_whitespace(column)
             if self._decimal == ",":
-                trimmed = pa.compute.replace_substring(trimmed, ",", ".")
+                trimmed = pc.replace_substring(trimmed, ",", ".")
             try:
                 columns.append(trimmed.cast(pa.float64()))
             except pa.ArrowInvalid as error:

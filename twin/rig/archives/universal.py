@@ -1,7 +1,6 @@
 """Universal files (UFF): the time responses of dataset 58, ASCII or binary (pyuff)."""
 
 import io
-import struct
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ class UniversalArchive(Archive):
         try:
             with redirect_stdout(io.StringIO()):  # it talks
                 read = pyuff.UFF(str(path)).read_sets()
-        except UNREADABLE as error:
+        except Exception as error:  # it raises bare exceptions
             raise InputError(f"{path}: is cut short or damaged ({error}); copy or export it again") from error
         sets: list[dict[str, Any]] = read if isinstance(read, list) else [read]
         found = [s for s in sets if s and s.get("type") == 58 and s.get("func_type") == TIME_RESPONSE]

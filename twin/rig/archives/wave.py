@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from twin.plant.errors import InputError
 from twin.rig.archives.base import Archive, guard_memory
 
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, ArithmeticError, MemoryError, RuntimeError, UnboundLocalError,
+    struct.error,
+)  # fmt: skip
 FULL_SCALE = {"u1": 128.0, "i2": 2.0**15, "i4": 2.0**31}
 
 
@@ -32,7 +36,7 @@ class WaveArchive(Archive):
         super().__init__(path)
         try:
             self._rate, self._data = _open(path)
-        except (ValueError, OSError, EOFError, struct.error, MemoryError, TypeError, KeyError) as error:
+        except UNREADABLE as error:
             raise InputError(f"{path}: is cut short, damaged or no PCM or float WAV ({error})") from error
         if self._data.ndim == 1:
             self._data = self._data[:, None]
