@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from twin.plant.errors import InputError
 from twin.rig.archives.base import Archive, guard_memory
 
-UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError,
-              MemoryError, RuntimeError, UnboundLocalError, struct.error)  # fmt: skip
 TIME_RESPONSE = 1
 
 
