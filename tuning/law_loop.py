@@ -10,12 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import matrix_balance
 
 from tuning.loop import Margins, loop_margins, margin_grid
-from tuning.sampled import SampledPlant
+from tuning.sampled import RELATIVE_ACCELERATION, SampledPlant
 from tuning.types import Powers
+from twin.control.chain import chain_matrices
+from twin.control.noise import stationary_covariance
+from twin.control.schedule import Gains
 from twin.plant.discrete import simulate_block
-from twin.plant.linear import Array, ComplexArray, natural_frequencies_hz
+from twin.plant.linear import Array, ComplexArray, natural_frequencies_hz, read_only
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,20 @@ class StateSpaceLaw:
         left = z[:, None, None] * np.eye(len(self.A)) - self.A.T
         row = np.linalg.solve(left, np.broadcast_to(self.C[:, None], (len(f), len(self.A), 1)))[:, :, 0]
         return np.asarray(row @ self.B + self.D)
+
+
+def rig_law(gains: Gains, force_constant_n_a: float, sample_rate_hz: float) -> StateSpaceLaw:
+    """The rig's own law, gains behind its filter chain, on the relative acceleration."""
+    A, B, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, sample_rate_hz)
+    row = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m]) / force_constant_n_a
+    return StateSpaceLaw(
+        A=read_only(A),
+        B=read_only(B),
+        C=read_only(row @ C),
+        D=read_only(row @ D),
+        channels=(RELATIVE_ACCELERATION,),
+        sample_rate_hz=sample_rate_hz,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +168,42 @@ class LawLoop:
                 electrical_mean_w=float(0.5 * (voltage * np.conj(current)).real),
             ),
         )
+
+    def noise_power_w(self, noise_density: ArrayLike | None = None) -> float:
+        """Mean Joule power that sensor noise alone burns in the coil [W]; infinite if the loop is unstable.
+
+        Parameters
+        ----------
+        noise_density
+            (p,) one-sided, white up to half the sample rate, in each channel's unit per sqrt(Hz); None takes the
+            sensors' own.
+        """
+        p, law = self.plant, self.law
+        density = np.broadcast_to(
+            np.asarray(p.noise_density if noise_density is None else noise_density, dtype=np.float64),
+            (len(law.channels),),
+        )
+        whole = self.matrices()[0]
+        n, line = len(p.F), p.waiting
+        into = np.zeros((len(whole), len(density)))
+        if line:
+            into[n] = law.D
+        else:
+            into[:n] = np.outer(p.late, law.D)
+        into[n + line :] = law.B
+        into = into * density * math.sqrt(0.5 * p.facts.sample_rate_hz)
+        balanced, transform = matrix_balance(whole, permute=False, separate=True)
+        scale = np.asarray(transform[0])
+        into = into / scale[:, None]
+        if float(np.abs(np.linalg.eigvals(balanced)).max()) >= 1.0:
+            return math.inf
+        covariance = stationary_covariance(np.asarray(balanced), into @ into.T)
+        if covariance is None:
+            return math.inf
+        current = np.zeros(len(whole))
+        current[:n] = p.motion[2]
+        current *= scale
+        return float(p.coil.resistance_ohm * (current @ covariance @ current))
 
     def simulate(self, excitation: ArrayLike) -> Array:
         """Primary motion [m], stroke [m] and coil current [A] from rest under an excitation, (N, 3).

@@ -13,7 +13,10 @@ from twin.plant.errors import InputError
 from twin.plant.linear import Array, ComplexArray, LinearModel, linear_model, read_only
 
 RELATIVE_ACCELERATION = "relative_acceleration"
-"""Channel that the rig forms of its two accelerometers: the coil's first body against its second."""
+"""Channel that the rig forms of its two accelerometers: the coil's first body against its second.
+
+In a loop with absolute measurement the absorber's accelerometer alone stands for it.
+"""
 ACCELEROMETER_DENSITY = 1e-3
 """Noise of an accelerometer that the plant does not list [m/s² per sqrt(Hz)]; the rig's have it."""
 
@@ -133,8 +136,9 @@ def sampled_plant(
             continue
         row = order[name]
         motion[1, row] = sign
-        relative += sign * model.A[n + row]
-        relative_feed += sign * float(model.B[n + row, drive])
+        if facts.relative or name == absorber.name:
+            relative += sign * model.A[n + row]
+            relative_feed += sign * float(model.B[n + row, drive])
     motion[2, model.states.index(f"i_{coil.name}")] = 1.0
     sensors = {s.name: s for s in plant.sensor}
     accelerometers = tuple(s.name for s in plant.sensor if s.kind == "acceleration")
@@ -144,7 +148,7 @@ def sampled_plant(
         if name == RELATIVE_ACCELERATION:
             rows.append(relative)
             feed.append(relative_feed)
-            density.append(relative_noise_density(plant))
+            density.append(relative_noise_density(plant, facts.relative))
         elif name in model.outputs:
             place = model.outputs.index(name)
             if model.D[place, j] != 0.0:
@@ -177,15 +181,20 @@ def sampled_plant(
     )
 
 
-def relative_noise_density(plant: Plant) -> float:
+def relative_noise_density(plant: Plant, relative: bool = True) -> float:
     """One-sided noise density of the relative acceleration formed of two accelerometers [m/s² per sqrt(Hz)].
 
     Of the sensors on the coil's bodies; where the plant lists none there, that of the rig's accelerometers.
+
+    Parameters
+    ----------
+    relative
+        False if the absorber's accelerometer alone stands for it.
     """
-    coil = plant.voice_coil
+    coil, absorber = plant.voice_coil, plant.absorber
     total = 0.0
     for name in () if coil is None or coil.between is None else coil.between:
-        if name != GROUND:
+        if name != GROUND and (relative or (absorber is not None and name == absorber.name)):
             listed = [s.noise_density for s in plant.sensor if s.kind == "acceleration" and s.of == name]
             total += (listed[0] if listed else ACCELEROMETER_DENSITY) ** 2
     return math.sqrt(total)

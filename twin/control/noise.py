@@ -115,7 +115,7 @@ def _held_noise(
     block[:n, :n], block[:n, n:] = scaled, B / scale[:, None]
     step = expm(block / sample_rate_hz)
     noise = np.diag(np.asarray(variance, dtype=np.float64))
-    P = _stationary(step[:n, :n], step[:n, n:] @ noise @ step[:n, n:].T)
+    P = stationary_covariance(step[:n, :n], step[:n, n:] @ noise @ step[:n, n:].T)
     if P is None:
         return NoiseEffect(math.inf, math.inf)
     out = row * scale
@@ -123,10 +123,18 @@ def _held_noise(
     return NoiseEffect(float(scale[0]) * math.sqrt(float(P[0, 0])), math.sqrt(force))
 
 
-def _stationary(F: Array, Q: Array) -> Array | None:
+def stationary_covariance(F: Array, Q: Array) -> Array | None:
     """Solve ``P = F P F' + Q`` by doubling: a sum of squares, exact also for poles close to the unit circle.
 
-    None if F has an eigenvalue on the unit circle or outside.
+    Parameters
+    ----------
+    F, Q
+        (n, n), in states of like size.
+
+    Returns
+    -------
+    ndarray or None
+        (n, n); None if F has an eigenvalue on the unit circle or outside.
     """
     P = Q
     for _ in range(64):
