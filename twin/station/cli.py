@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from twin.plant.errors import InputError, RunError
+from twin.station.library import recordings_app
 from twin.station.terminal import (
     JsonOption,
     must_be_writable,
@@ -33,6 +34,9 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.add_typer(recordings_app)
 
 
 class ControllerName(StrEnum):
@@ -472,6 +476,58 @@ def export(
         made=made,
     )
     report(run_export(options, say), export_table, json_to)
+
+
+@app.command(
+    epilog="Examples: atmd whatif --plant rig --set budget_w=1 --set low_pass_hz=800   ·   "
+    "atmd whatif runs/demo.rrd --at 35 --set modulus_margin=0.3 --plot whatif.png"
+)
+def whatif(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="Recording of this program (.rrd): what was known at its end or --at."),
+    ] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(metavar="PRESET|FILE", help="A plant as its file has it, with the thesis's gains."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="What is different; may be repeated.")
+    ] = None,
+    band: Annotated[
+        str, typer.Option(metavar="FROM:TO:STEP|LIST", help="Excitation frequencies in Hz.")
+    ] = "45:55:1",
+    at: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Instant of the recording in s; the twin is run on from there."),
+    ] = None,
+    branch_s: Annotated[
+        float, typer.Option(min=0.1, max=60.0, metavar="S", help="How far it is run on, in s.")
+    ] = 1.0,
+    delay_us: Annotated[
+        float, typer.Option(min=0.0, metavar="US", help="Loop delay in µs, with --plant.")
+    ] = 50.0,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw the curves and branches.")
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Predict motion, power and margins over the band for other settings, beside the physical limit.
+
+    Keys of --set: budget_w, budget_kind, power_price_um_w (spend a watt only where it buys so many µm),
+    modulus_margin, low_pass_hz, high_pass_hz, excitation (peak), damping_ns_m or damping_scale (of the absorber),
+    resistance_ohm, inductance_h, force_constant_n_a, coil (a preset's or plant file's), on_from_hz, on_to_hz. With --at
+    the whole twin is run on from that instant under each candidate: control off, gains in use, gains proposed; its
+    standard deviation covers the estimate, unknown forces and the damping. JSON keys: points (frequency_hz,
+    damping_ns_m, passive_displacement_m, limit_displacement_m, in_use and proposed with displacement_m, powers,
+    margins, gains), branches (name, displacement_m, displacement_std_m, current_a, off_measured_rms_m), budget_w,
+    budget_kind, excitation.
+    """
+    from twin.station.whatif import WhatIfOptions, run_whatif, whatif_table
+
+    must_be_writable(json_to)
+    options = WhatIfOptions(file, plant, tuple(settings or ()), band, at, branch_s, delay_us, plot)
+    report(run_whatif(options, say), whatif_table, json_to)
 
 
 @app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")

@@ -12,6 +12,7 @@ from twin.plant.blocks import Block
 from twin.plant.linear import Array
 
 if TYPE_CHECKING:
+    from twin.station.audit import AuditPoint
     from twin.station.worker import Arrival
 
 
@@ -71,6 +72,8 @@ class Frame:
         Whether model and rig agree, and who says that they do not.
     asked, arrival
         Number of the question asked of the tuner after this block, and what was taken of it at this block.
+    audited
+        What the gains in use were promised to do at an earlier block, beside what they did.
     phasors, curve, performance
         None where the plant has no such part or the block no excitation.
     """
@@ -90,3 +93,4 @@ class Frame:
     events: tuple[Event, ...]
     asked: int | None = None
     arrival: "Arrival | None" = None
+    audited: "AuditPoint | None" = None

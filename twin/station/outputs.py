@@ -150,6 +150,8 @@ class Outputs:
             if frame.arrival is not None:
                 taken = {"number": frame.arrival.number, "trouble": frame.arrival.trouble}
                 recorder.write_note("answers", sample, json.dumps(taken))
+            if frame.audited is not None:
+                recorder.write_note("audit", frame.audited.sample, json.dumps(asdict(frame.audited)))
             if frame.decision is not None:
                 recorder.write_note("decisions", frame.decision.sample, json.dumps(asdict(frame.decision)))
         if self._file_view is not None:

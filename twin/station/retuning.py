@@ -90,6 +90,8 @@ class Retuning:
         Motion without control and the physical limit at the excitation [m], of the last answer.
     goal
         What is asked of the tuner; may be changed between blocks.
+    same_for_blocks
+        Blocks since the gains in use last changed.
     outdated
         Proposals dropped because the model or the schedule had moved on.
     """
@@ -113,6 +115,7 @@ class Retuning:
         self._promised_by: Plant | None = None
         self._next_command = self._next_question = 1
         self._since_question = settings.every_blocks
+        self.same_for_blocks = 0
         self._on_its_way: int | None = None
         self._way_blocks = 0
         self._open: Question | None = None
@@ -127,11 +130,13 @@ class Retuning:
     def note(self, block: Block, acknowledgements: tuple[Acknowledgement, ...]) -> None:
         """Take in what the rig says it has done."""
         self._way_blocks += 1
+        self.same_for_blocks += 1
         refused = {a.command_id for a in acknowledgements if not a.accepted}
         for number in block.commands_applied:
             command = self.commands.get(number)
             if command is not None and command.schedule is not None:
                 self.schedule = command.schedule
+                self.same_for_blocks = 0
                 self._promised_by = self._promises.pop(number, None)
         known = self._on_its_way
         if known in refused or known in block.commands_applied or self._way_blocks > FORGOTTEN_BLOCKS:

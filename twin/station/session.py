@@ -27,6 +27,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.inputs import DriveReader, driven_model
 from twin.plant.parallel import ParallelPlant
+from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, AuditPoint, audit_point
 from twin.station.frame import Event, Frame, Performance
 from twin.station.performance import PerformanceMeter
 from twin.station.retuning import Retuning, RetuningSettings, Turn
@@ -126,6 +127,7 @@ class Session:
         self._start_learning(names, recorded_commands, tuner)
         self._modelled_damping = self._damping_now()
         self._meter = PerformanceMeter(plant, names)
+        self._to_audit: tuple[int, float, Performance, float] | None = None
         self._blocks = 0
         self._control_on: bool | None = None
         self._since_switch = SETTLE_BLOCKS
@@ -180,7 +182,7 @@ class Session:
         if twin._learner is not None:
             twin._learner.warm_up()
         if self.retuning is not None:
-            self.retuning.warm_up(self._plant_now())
+            self.retuning.warm_up(self.identified_plant())
 
     def advance(self, block: Block, acknowledgements: tuple[Acknowledgement, ...] = ()) -> Frame:
         """Take one block through the whole chain.
@@ -207,6 +209,7 @@ class Session:
         turn = self._retune(block, phasors, moved, curve, health)
         events.extend(turn.events)
         performance = self._performance(block, phasors, estimate)
+        audited = self._audit(turn, block, phasors, performance)
         self._blocks += 1
         return Frame(
             block=raw,
@@ -224,6 +227,7 @@ class Session:
             events=tuple(events),
             asked=turn.asked,
             arrival=turn.arrival,
+            audited=audited,
         )
 
     def _note_changes(self, block: Block, acknowledgements: tuple[Acknowledgement, ...]) -> list[Event]:
@@ -314,7 +318,12 @@ class Session:
             return 0.0
         return self._learner.table().at(self._frequency)
 
-    def _plant_now(self) -> Plant:
+    def damping_std_at(self, frequency_hz: float) -> float:
+        """Standard deviation of the learned damping at a frequency [Ns/m]; 0 where none is learned."""
+        return 0.0 if self._learner is None else self._learner.std_at(frequency_hz)
+
+    def identified_plant(self) -> Plant:
+        """Return the plant with the damping in use."""
         absorber = self.plant.absorber
         if self._learner is None or absorber is None:
             return self.plant
@@ -325,7 +334,7 @@ class Session:
         if abs(damping - self._modelled_damping) <= self.settings.model_step_ns_m:
             return
         self._modelled_damping = damping
-        plant = self._plant_now()
+        plant = self.identified_plant()
         model, discrete = driven_model(
             plant, self.observer.sources, self.observer.sample_rate_hz, self._frequency
         )
@@ -351,7 +360,7 @@ class Session:
             amplitude,
             moved_hz,
             curve,
-            self._plant_now(),
+            self.identified_plant(),
             self._learner,
             doubt=health.reason if health.verdict == "diverged" else "",
         )
@@ -363,6 +372,32 @@ class Session:
         bounds = (math.nan, math.nan) if retuning is None else retuning.bounds_m
         goal = self.settings.goal if retuning is None else retuning.goal
         return self._meter.measure(block, phasors, estimate, bounds, goal.budget_w)
+
+    def _audit(
+        self, turn: Turn, block: Block, phasors: Phasors | None, performance: Performance | None
+    ) -> AuditPoint | None:
+        """Hold an answer's promise against the block it was asked at, if settled; keep this block for the next."""
+        point, arrival, kept = None, turn.arrival, self._to_audit
+        if arrival is not None and arrival.answer is not None and kept is not None:
+            answer = arrival.answer
+            if answer.promise is not None:
+                sample, frequency, achieved, noise = kept
+                point = audit_point(sample, frequency, answer.promise, answer.promise_std_m, achieved, noise)
+        if arrival is not None:
+            self._to_audit = None
+        retuning = self.retuning
+        if turn.asked is None or retuning is None or phasors is None or performance is None:
+            return point
+        settled = (
+            bool(block.control_on)
+            and self._since_switch >= SETTLED_BLOCKS
+            and retuning.same_for_blocks >= SETTLED_BLOCKS
+            and self._meter.drift_1_s(phasors) < SETTLED_1_S
+        )
+        if settled:
+            noise = self._meter.displacement_std(phasors)
+            self._to_audit = (block.end_sample - 1, phasors.frequency_hz, performance, noise)
+        return point
 
     def configuration(self) -> dict[str, Any]:
         """Settings as plain data, for the recording; `settings_from` reads them back."""

@@ -9,6 +9,7 @@ import numpy as np
 from estimators.types import DampingCurve
 from twin.plant.config import DampingTable
 from twin.plant.linear import Array
+from twin.station.audit import Audit
 from twin.station.frame import Frame
 
 BAND_HZ = (45.0, 55.0)
@@ -35,6 +36,9 @@ class RunLog:
     samples: int = 0
     masked: int = 0
     commands: int = 0
+    questions: int = 0
+    outdated: int = 0
+    audit: Audit = field(default_factory=Audit)
     _on_for_s: float = 0.0
 
     def add(self, frame: Frame) -> None:
@@ -45,6 +49,11 @@ class RunLog:
         valid = frame.checked.block.valid
         self.masked += valid.size - int(valid.sum())
         self.commands += frame.command is not None
+        if frame.decision is not None and frame.decision.reason.startswith("outdated"):
+            self.outdated += 1
+        self.questions += frame.asked is not None
+        if frame.audited is not None:
+            self.audit.points.append(frame.audited)
         self.curve = frame.curve or self.curve
         self._on_for_s = self._on_for_s + block.n_samples / block.sample_rate_hz if block.control_on else 0.0
         self.nis.append(frame.estimate.nis)
@@ -95,6 +104,8 @@ class RunLog:
             "samples": self.samples,
             "masked_samples": self.masked,
             "commands": self.commands,
+            "outdated_proposals": self.outdated if self.questions else None,
+            "audit": self.audit.summary() if self.audit.points else None,
         }
 
 
