@@ -18,7 +18,7 @@ SETTLED_BLOCKS = 3
 """Blocks under the same gains before the motion counts as settled."""
 
 SETTLED_1_S = 0.5
-"""Nor may the primary's amplitude or phase move faster than this, |A'/A|."""
+"""Nor may the absorber's amplitude or phase move faster than this, or the primary's, |A'/A|."""
 
 FLOOR_SIGMAS = 20.0
 """Motion below so many standard deviations of what is unknown is no test at five per cent."""
@@ -59,12 +59,13 @@ class AuditPoint:
 
 
 def audit_point(
-    sample: int,
-    frequency_hz: float,
     promise: Prediction,
     promise_std_m: float,
+    sample: int,
+    frequency_hz: float,
     achieved: Performance,
     noise_std_m: float,
+    rate_m_s: float,
 ) -> AuditPoint:
     """Hold a promise against what was achieved.
 
@@ -74,6 +75,8 @@ def audit_point(
         Standard deviation of the promised displacement by the damping's own.
     noise_std_m
         Of the achieved displacement, by the block's noise.
+    rate_m_s
+        How fast the achieved displacement still moves: below the floor is also what has not settled.
     """
     powers = achieved.powers
     return AuditPoint(
@@ -82,7 +85,7 @@ def audit_point(
         displacement_m=(promise.displacement_m, achieved.displacement_m),
         joule_mean_w=(promise.powers.joule_mean_w, powers.joule_mean_w),
         electrical_mean_w=(promise.powers.electrical_mean_w, powers.electrical_mean_w),
-        floor_m=FLOOR_SIGMAS * math.hypot(promise_std_m, noise_std_m),
+        floor_m=max(FLOOR_SIGMAS * math.hypot(promise_std_m, noise_std_m), rate_m_s / SETTLED_1_S),
     )
 
 

@@ -25,7 +25,11 @@ class PerformanceMeter:
 
     def __init__(self, plant: Plant, channels: tuple[str, ...]) -> None:
         self._coil = plant.voice_coil
-        self._column, self._order = -1, 0
+        self._column, self._order, self._absorber = -1, 0, -1
+        absorber = plant.absorber
+        for sensor in plant.sensor:
+            if absorber is not None and sensor.kind == "acceleration" and sensor.of == absorber.name:
+                self._absorber = channels.index(sensor.name) if sensor.name in channels else -1
         for sensor in plant.sensor:
             order = {"displacement": 0, "velocity": 1, "acceleration": 2}.get(sensor.kind)
             if order is not None and sensor.of == plant.primary.name and sensor.name in channels:
@@ -75,11 +79,17 @@ class PerformanceMeter:
         variance = float(phasors.variance[self._column])
         return math.sqrt(variance) / (math.tau * phasors.frequency_hz) ** self._order
 
-    def drift_1_s(self, phasors: Phasors) -> float:
-        """How fast the primary body's amplitude or phase moves, |A'/A|; infinite if nothing measures it."""
-        if self._column < 0 or phasors.amplitude[self._column] == 0.0:
+    def displacement_rate(self, phasors: Phasors) -> float:
+        """How fast amplitude or phase of `displacement` move [m/s]; NaN if nothing measures it."""
+        if self._column < 0:
+            return math.nan
+        return float(abs(phasors.slope[self._column]) / (math.tau * phasors.frequency_hz) ** self._order)
+
+    def absorber_drift_1_s(self, phasors: Phasors) -> float:
+        """How fast the absorber's amplitude or phase moves, |A'/A|; infinite if nothing measures it."""
+        if self._absorber < 0 or phasors.amplitude[self._absorber] == 0.0:
             return math.inf
-        return float(abs(phasors.slope[self._column] / phasors.amplitude[self._column]))
+        return float(abs(phasors.slope[self._absorber] / phasors.amplitude[self._absorber]))
 
 
 def _current_of(coil: VoiceCoil, estimate: StateEstimate) -> Array | None:

@@ -127,7 +127,7 @@ class Session:
         self._start_learning(names, recorded_commands, tuner)
         self._modelled_damping = self._damping_now()
         self._meter = PerformanceMeter(plant, names)
-        self._to_audit: tuple[int, float, Performance, float] | None = None
+        self._to_audit: tuple[int, float, Performance, float, float] | None = None
         self._blocks = 0
         self._control_on: bool | None = None
         self._since_switch = SETTLE_BLOCKS
@@ -381,8 +381,7 @@ class Session:
         if arrival is not None and arrival.answer is not None and kept is not None:
             answer = arrival.answer
             if answer.promise is not None:
-                sample, frequency, achieved, noise = kept
-                point = audit_point(sample, frequency, answer.promise, answer.promise_std_m, achieved, noise)
+                point = audit_point(answer.promise, answer.promise_std_m, *kept)
         if arrival is not None:
             self._to_audit = None
         retuning = self.retuning
@@ -392,11 +391,11 @@ class Session:
             bool(block.control_on)
             and self._since_switch >= SETTLED_BLOCKS
             and retuning.same_for_blocks >= SETTLED_BLOCKS
-            and self._meter.drift_1_s(phasors) < SETTLED_1_S
+            and self._meter.absorber_drift_1_s(phasors) < SETTLED_1_S
         )
         if settled:
-            noise = self._meter.displacement_std(phasors)
-            self._to_audit = (block.end_sample - 1, phasors.frequency_hz, performance, noise)
+            noise, rate = self._meter.displacement_std(phasors), self._meter.displacement_rate(phasors)
+            self._to_audit = (block.end_sample - 1, phasors.frequency_hz, performance, noise, rate)
         return point
 
     def configuration(self) -> dict[str, Any]:
