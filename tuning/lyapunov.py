@@ -33,14 +33,14 @@ MOST_DOUBLINGS = 46
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """The loop at some frequencies, ascending.
+    """The loop at the knots of a function, and half-way between them, where a function is bent most.
 
     Attributes
     ----------
     frequency_hz
-        (m,) [Hz].
+        (2 m - 1,) ascending [Hz]: every other one, from the first, is a knot.
     A
-        (m, n, n) one sample of the closed loop.
+        (2 m - 1, n, n) one sample of the closed loop.
     dt
         Sample period [s].
     """
@@ -48,6 +48,11 @@ class Samples:
     frequency_hz: Array
     A: Array
     dt: float
+
+    @property
+    def knots_hz(self) -> Array:
+        """(m,) [Hz]."""
+        return self.frequency_hz[::2]
 
     def scaled(self, scale: Array) -> "Samples":
         """The same with state i in units of ``scale[i]``."""
@@ -61,7 +66,7 @@ def balancing_scale(A: Array, dt: float) -> Array:
 
 
 def frozen_functions(samples: Samples, weights: Array) -> Array | None:
-    """P of ``(A' P A - P)/dt = -diag(weights)`` at every frequency, by doubling; None for a loop that is unstable.
+    """P of ``(A' P A - P)/dt = -diag(weights)`` at every knot, by doubling; None for a loop that is unstable.
 
     Returns
     -------
@@ -69,8 +74,8 @@ def frozen_functions(samples: Samples, weights: Array) -> Array | None:
         (m, n, n).
     """
     n = len(weights)
-    P = np.broadcast_to(np.diag(weights) * samples.dt, samples.A.shape).copy()
-    power = samples.A.copy()
+    power = samples.A[::2].copy()
+    P = np.broadcast_to(np.diag(weights) * samples.dt, power.shape).copy()
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MOST_DOUBLINGS):
             P += np.swapaxes(power, 1, 2) @ P @ power
@@ -135,12 +140,28 @@ def admissible_rate_hz_s(A: Array, P: Array, slope: Array, dt: float, least_deca
 
 
 def frozen_rate_hz_s(samples: Samples, P: Array, weights: Array) -> float:
-    """Admissible rate of frozen functions at the knots, over all intervals [Hz/s]: what the program starts from."""
-    slopes = np.diff(P, axis=0) / np.diff(samples.frequency_hz)[:, None, None]
+    """Admissible rate of frozen functions at all samples [Hz/s]: what the program starts from.
+
+    Returns
+    -------
+    float
+        Where they do not even fall at rest half-way between two knots: minus a measure of by how much not.
+    """
     unit = 1.0 / np.sqrt(weights)
+    slopes = np.diff(P, axis=0) / np.diff(samples.knots_hz)[:, None, None]
+    middle, A = 0.5 * (P[:-1] + P[1:]), samples.A[1::2]
+    still = (middle - np.swapaxes(A, 1, 2) @ middle @ A) / samples.dt * (unit[:, None] * unit)
+    least = float(np.linalg.eigvalsh(0.5 * (still + np.swapaxes(still, 1, 2))).min())
+    if least <= 0.0:
+        return least - 1e-9
     largest = 0.0
-    for A in (samples.A[:-1] * unit, samples.A[1:] * unit):
-        largest = max(largest, float(np.abs(np.linalg.eigvalsh(np.swapaxes(A, 1, 2) @ slopes @ A)).max()))
+    for A, share in (
+        (samples.A[:-1:2], 1.0),
+        (samples.A[2::2], 1.0),
+        (samples.A[1::2], 1.0 / min(least, 1.0)),
+    ):
+        turned = np.swapaxes(A * unit, 1, 2) @ slopes @ (A * unit)
+        largest = max(largest, share * float(np.abs(np.linalg.eigvalsh(turned)).max()))
     return math.inf if largest == 0.0 else 1.0 / largest
 
 
@@ -150,7 +171,7 @@ def starting_functions(samples: Samples) -> tuple[Array, Array] | None:
     Returns
     -------
     tuple or None
-        P (m, n, n) and the weights (n,); None if the loop is unstable at one of the frequencies.
+        P (m, n, n) and the weights (n,); None if the loop is unstable at one of the knots.
     """
     n = samples.A.shape[1]
     exponents = np.zeros(n)
@@ -166,7 +187,7 @@ def starting_functions(samples: Samples) -> tuple[Array, Array] | None:
                 trial = exponents.copy()
                 trial[i] += change
                 P = frozen_functions(samples, 10.0**trial)
-                found = 0.0 if P is None else frozen_rate_hz_s(samples, P, 10.0**trial)
+                found = -math.inf if P is None else frozen_rate_hz_s(samples, P, 10.0**trial)
                 if P is not None and found > rate:
                     best, rate, exponents = P, found, trial
                     break
@@ -187,24 +208,25 @@ class MovingProgram:
     """
 
     def __init__(self, samples: Samples, start: Array, weights: Array) -> None:
-        f, dt, n = samples.frequency_hz, samples.dt, samples.A.shape[1]
+        f, dt, n = samples.knots_hz, samples.dt, samples.A.shape[1]
         self._T = np.array([np.linalg.cholesky(P).T for P in start])
         self._X = [cp.Variable((n, n), symmetric=True) for _ in f]
         self._rate = cp.Parameter(nonneg=True)
-        slack, unit = cp.Variable(), 1.0 / np.sqrt(weights)
-        eye = np.eye(n)
+        slack, unit, eye = cp.Variable(), 1.0 / np.sqrt(weights), np.eye(n)
         limits = [slack <= 1.0]
         for X in self._X:
             limits += [X >> LEAST_EIGENVALUE * eye, cp.trace(X) <= LARGEST_TRACE * n]
         for k in range(len(f) - 1):
-            for j in (k, k + 1):
-                A, X, T = samples.A[j] * unit, self._X[j], self._T[j]
-                change, here = T @ ((samples.A[j] - eye) / dt * unit), T * unit
-                after, before = self._T[k + 1] @ A, self._T[k] @ A
-                still = change.T @ X @ here + here.T @ X @ change + dt * (change.T @ X @ change)
-                drift = (after.T @ self._X[k + 1] @ after - before.T @ self._X[k] @ before) / (
-                    f[k + 1] - f[k]
+            pair = (self._T[k], self._X[k]), (self._T[k + 1], self._X[k + 1])
+            for j, shares in ((2 * k, (1.0, 0.0)), (2 * k + 1, (0.5, 0.5)), (2 * k + 2, (0.0, 1.0))):
+                A, change = samples.A[j] * unit, (samples.A[j] - eye) / dt * unit
+                still = sum(
+                    share * _fall(T, X, change, unit, dt)
+                    for (T, X), share in zip(pair, shares, strict=True)
+                    if share
                 )
+                before, after = ((T @ A).T @ X @ (T @ A) for T, X in pair)
+                drift = (after - before) / (f[k + 1] - f[k])
                 for sign in (1.0, -1.0):
                     whole = still + sign * (self._rate * drift)
                     limits.append(0.5 * (whole + whole.T) << -slack * eye)
@@ -228,13 +250,17 @@ def one_function(samples: Samples, start: Array, weights: Array) -> Array | None
     T, unit, eye = np.linalg.cholesky(start).T, 1.0 / np.sqrt(weights), np.eye(len(start))
     X, slack = cp.Variable((n, n), symmetric=True), cp.Variable()
     limits = [slack <= 1.0, X >> LEAST_EIGENVALUE * eye, cp.trace(X) <= LARGEST_TRACE * n]
-    here = T * unit
     for A in samples.A:
-        change = T @ ((A - eye) / dt * unit)
-        still = change.T @ X @ here + here.T @ X @ change + dt * (change.T @ X @ change)
+        still = _fall(T, X, (A - eye) / dt * unit, unit, dt)
         limits.append(0.5 * (still + still.T) << -slack * eye)
     found = _candidate(cp.Problem(cp.Maximize(slack), limits), [(T, X)])
     return None if found is None else found[0]
+
+
+def _fall(T: Any, X: Any, change: Any, unit: Array, dt: float) -> Any:
+    """``(A' P A - P)/dt`` of ``P = T' X T``, from change ``(A - I)/dt``: no difference of nearly equal numbers."""
+    here, moved = T * unit, T @ change
+    return moved.T @ X @ here + here.T @ X @ moved + dt * (moved.T @ X @ moved)
 
 
 def _candidate(problem: cp.Problem, unknowns: list[tuple[Any, Any]]) -> Array | None:

@@ -44,6 +44,7 @@ LEAST_DECAY_1_S = 1e-3
 """V must fall at least this fast: what is slower is not told from rounding."""
 
 STILL_1_S = 1e-6
+FIRST_HZ_S = 1.0
 
 Method = Literal["one function", "function of frequency", "none"]
 
@@ -97,7 +98,8 @@ class _Loop:
             self._known[frequency_hz] = model.closed_loop_matrix(self._schedule.at(frequency_hz))
         return self._known[frequency_hz]
 
-    def samples(self, frequency_hz: Array) -> Samples:
+    def samples(self, knots_hz: Array) -> Samples:
+        frequency_hz = np.unique(np.concatenate([knots_hz, 0.5 * (knots_hz[:-1] + knots_hz[1:])]))
         return Samples(frequency_hz, np.array([self(float(f)) for f in frequency_hz]), self.dt)
 
     def growth_1_s(self, frequency_hz: float) -> float:
@@ -255,7 +257,7 @@ def _try_one(
     loop: _Loop, kinks: Array, samples: Samples, start: tuple[Array, Array], scale: Array
 ) -> TransitionCertificate | None:
     """One function for the whole table, if there is one that passes."""
-    middle = len(samples.frequency_hz) // 2
+    middle = len(start[0]) // 2
     candidates: list[Callable[[], Array | None]] = [
         lambda: start[0][middle],
         lambda: one_function(samples, start[0][middle], start[1]),
@@ -264,7 +266,7 @@ def _try_one(
         P = candidate()
         if P is None:
             continue
-        knots = samples.frequency_hz[[0, -1]]
+        knots = samples.knots_hz[[0, -1]]
         functions = _unscaled(np.array([P, P]), scale)
         margin = min(_worst_margin(loop, kinks, knots, functions, 0.0, offset) for offset in (0.0, 0.381966))
         if margin > 0.0:
@@ -288,7 +290,7 @@ def _fastest(
     def judge(P: Array) -> bool:
         nonlocal best
         functions = _unscaled(P, scale)
-        rate = SAFETY * _verified_rate(loop, kinks, samples.frequency_hz, functions)
+        rate = SAFETY * _verified_rate(loop, kinks, samples.knots_hz, functions)
         if rate > 0.0 and (best is None or rate > 1.02 * best[0]):
             best = (rate, functions)
             return True
@@ -298,7 +300,7 @@ def _fastest(
     if most_solves <= 0 or (best is not None and best[0] >= enough_hz_s):
         return best
     program = MovingProgram(samples, *start)
-    asked, failed = frozen_rate_hz_s(samples, *start), math.inf
+    asked, failed = max(frozen_rate_hz_s(samples, *start), FIRST_HZ_S), math.inf
     for _ in range(most_solves):
         # Doubled while it works, then halved in between: bisection on the logarithm of the rate.
         asked = 2.0 * asked if failed == math.inf else math.sqrt(asked * failed)
@@ -308,9 +310,12 @@ def _fastest(
             if asked >= enough_hz_s:
                 break
             continue
-        failed, asked = asked, (best[0] if best is not None else 0.25 * asked)
-        if failed < 1.05 * asked:
+        if best is None and asked > FIRST_HZ_S:
+            asked = 0.1 * asked
+            continue
+        if best is None or asked < 1.05 * best[0]:
             break
+        failed, asked = asked, best[0]
     return best
 
 

@@ -25,7 +25,7 @@ from twin.station.firmware_header import c_header
 from twin.station.handover import Budget, CoilData, ExcitationData, Handover, LoopTiming, TransitionData
 
 DRIVE_V, FORCE_N = 4.0, 1000.0
-ENOUGH_HZ_S = 10.0
+ENOUGH_HZ_S = 5.0
 """Sweeps faster than this are of no interest: a grid moves by a few Hz/s at worst."""
 
 
