@@ -349,45 +349,45 @@ def tune_jointly(
         If no round ends with gains and cutoffs that are stable and keep the noise budget together.
     """
     box = bounds or CutoffBounds()
-    try:
-        gains = solve_gains(*start_hz)
-    except RunError:
-        # With the filters in use nothing keeps the margin: begin with those that shift the phase least.
-        gains = solve_gains(box.low_pass_max_hz, box.high_pass_min_hz)
-    budget, best, trouble = noise_budget_w, None, "no round was run"
-    for done in range(1, rounds + 1):
+    trouble = ""
+    # Gains for lagging filters may be unstable behind any others: then begin again with those that lag least.
+    best: JointTuning | None = None
+    for begin in (start_hz, (box.low_pass_max_hz, box.high_pass_min_hz)):
         try:
-            wanted = program.solve(
-                gains,
-                frequency_hz,
-                noise_budget_w=budget,
-                bounds=box,
-                damping_ns_m=damping_ns_m,
-                slowest_decay_1_s=slowest_decay_1_s,
-            )
-            gains = solve_gains(wanted.low_pass_hz, wanted.high_pass_hz)
+            gains, budget = solve_gains(*begin), noise_budget_w
+            for done in range(1, rounds + 1):
+                wanted = program.solve(
+                    gains,
+                    frequency_hz,
+                    noise_budget_w=budget,
+                    bounds=box,
+                    damping_ns_m=damping_ns_m,
+                    slowest_decay_1_s=slowest_decay_1_s,
+                )
+                gains = solve_gains(wanted.low_pass_hz, wanted.high_pass_hz)
+                held = program.verify(gains, frequency_hz, damping_ns_m)
+                if not (
+                    held.verified_noise_power_w <= noise_budget_w and held.decay_rate_1_s < -slowest_decay_1_s
+                ):
+                    # The new gains burn more than those the cutoffs were for: leave them room.
+                    trouble = f"sensor noise would burn {held.verified_noise_power_w:.3g} W, slowest pole "
+                    trouble += f"{held.decay_rate_1_s:+.2f} 1/s"
+                    budget *= min(0.9, 0.9 * noise_budget_w / held.verified_noise_power_w)
+                    continue
+                settled = best is not None and _apart(held, best.cutoffs) <= SETTLED
+                best = JointTuning(gains, held, done, settled)
+                if settled:
+                    return best
         except RunError as error:
             trouble = str(error)
-            break
-        held = program.verify(gains, frequency_hz, damping_ns_m)
-        fits = held.verified_noise_power_w <= noise_budget_w and held.decay_rate_1_s < -slowest_decay_1_s
-        if not fits:
-            # The new gains burn more than those the cutoffs were for: leave them room.
-            trouble = f"sensor noise would burn {held.verified_noise_power_w:.3g} W, slowest pole "
-            trouble += f"{held.decay_rate_1_s:+.2f} 1/s"
-            budget *= min(0.9, 0.9 * noise_budget_w / max(held.verified_noise_power_w, 1e-300))
-            continue
-        moved = (
-            math.inf
-            if best is None
-            else max(
-                abs(math.log(held.low_pass_hz / best.cutoffs.low_pass_hz)),
-                abs(math.log(held.high_pass_hz / best.cutoffs.high_pass_hz)),
-            )
-        )
-        best = JointTuning(gains, held, done, moved <= SETTLED)
-        if best.settled:
+        if best is not None:
             return best
-    if best is None:
-        raise RunError(f"gains and cutoffs do not come together at {frequency_hz:g} Hz: {trouble}")
-    return best
+    raise RunError(f"gains and cutoffs do not come together at {frequency_hz:g} Hz: {trouble}")
+
+
+def _apart(one: Cutoffs, other: Cutoffs) -> float:
+    """Largest relative difference of the cutoffs."""
+    return max(
+        abs(math.log(one.low_pass_hz / other.low_pass_hz)),
+        abs(math.log(one.high_pass_hz / other.high_pass_hz)),
+    )
