@@ -10,7 +10,16 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    model_serializer,
+    model_validator,
+)
 
 GROUND = "ground"
 
@@ -187,7 +196,8 @@ OneOrPair = Annotated[
 class Sensor(Frozen):
     """A measured channel. ``noise_density`` is one-sided, in the sensor's SI unit per sqrt(Hz).
 
-    A motion ``of`` two bodies is that of the first against the second.
+    A motion ``of`` two bodies is that of the first against the second. ``ac_coupled_hz`` is the corner of a
+    first-order high-pass in the acquisition's input stage [Hz]; None where constant values pass.
     ``recorded_as`` names it in foreign recordings: ``"y:mm"`` for an array y in mm.
     """
 
@@ -196,7 +206,16 @@ class Sensor(Frozen):
     of: OneOrPair
     noise_density: Positive
     range: Positive | None = None
+    ac_coupled_hz: Positive | None = None
     recorded_as: RecordedAs | None = None
+
+    @model_serializer(mode="wrap")
+    def _leave_out_no_coupling(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Plants without it keep the fingerprints under which recordings and learned curves know them.
+        data: dict[str, Any] = handler(self)
+        if self.ac_coupled_hz is None:
+            data.pop("ac_coupled_hz", None)
+        return data
 
     @property
     def unit(self) -> str:

@@ -33,7 +33,8 @@ class LinearModel:
     A, B, C, D
         Read-only arrays, (n, n), (n, m), (p, n), (p, m).
     states
-        ``x_<body>`` [m] and ``v_<body>`` [m/s] in the plant's order of bodies, then ``i_<actuator>`` [A].
+        ``x_<body>`` [m] and ``v_<body>`` [m/s] in the plant's order of bodies, then ``i_<actuator>`` [A], then
+        ``h_<sensor>`` [the sensor's unit], what the input stage of an AC-coupled sensor holds back.
     inputs
         Actuator names; the unit is the actuator's ``input_unit``.
     outputs
@@ -148,11 +149,19 @@ def linear_model(
         + tuple(f"v_{b}" for b in order)
         + tuple(f"i_{a.name}" for a in circuits)
     )
+    C_y = np.reshape(rows_c, (len(kept), size))
+    D_y = np.reshape(rows_d, (len(kept), len(plant.actuator)))
+    coupled = {
+        s.name: s.ac_coupled_hz for s in plant.sensor if s.ac_coupled_hz is not None and s.name in kept
+    }
+    if coupled:
+        A, B, C_y = _couple(A, B, C_y, D_y, {kept.index(name): hz for name, hz in coupled.items()})
+        states += tuple(f"h_{name}" for name in coupled)
     return LinearModel(
         A=read_only(A),
         B=read_only(B),
-        C=read_only(np.reshape(rows_c, (len(kept), size))),
-        D=read_only(np.reshape(rows_d, (len(kept), len(plant.actuator)))),
+        C=read_only(C_y),
+        D=read_only(D_y),
         states=states,
         inputs=tuple(index),
         outputs=tuple(kept),
@@ -217,6 +226,20 @@ def _circuit(
     A[row, n : 2 * n] = -coil.force_constant_n_a * push / coil.inductance_h
     A[row, row] = -(coil.resistance_ohm + (kp or 0.0)) / coil.inductance_h
     B[row, column] = (kp or 1.0) / coil.inductance_h
+
+
+def _couple(
+    A: Array, B: Array, C: Array, D: Array, corners_hz: Mapping[int, float]
+) -> tuple[Array, Array, Array]:
+    """Append ``h' = w (y - h)`` for some outputs, which then show ``y - h``: a high-pass of first order each."""
+    n, more = len(A), len(corners_hz)
+    A, C = np.pad(A, ((0, more), (0, more))), np.pad(C, ((0, 0), (0, more)))
+    B = np.pad(B, ((0, more), (0, 0)))
+    for column, (row, corner_hz) in enumerate(corners_hz.items(), start=n):
+        w = 2.0 * np.pi * corner_hz
+        A[column, :n], A[column, column], B[column] = w * C[row, :n], -w, w * D[row]
+        C[row, column] = -1.0
+    return A, B, C
 
 
 def _sensor_row(

@@ -1,0 +1,119 @@
+"""The steady covariance of a Kalman filter: the discrete algebraic Riccati equation by doubling.
+
+``P = F P F' + Q - F P H' (H P H' + R)^-1 H P F'``, P the covariance before a measurement. The structure-preserving
+doubling algorithm (Chu, Fan, Lin and Wang 2004; Anderson 1978) takes as many steps of the recursion at its k-th
+iteration as all before together: some twenty iterations stand for a million samples.
+"""
+
+import numpy as np
+
+from estimators.small_matrices import multiply, multiply_transposed, solve_in_place
+from twin.plant.compiled import kernel
+from twin.plant.linear import Array
+
+MAX_DOUBLINGS = 60
+"""2^60 samples: what has not settled by then never does."""
+
+
+def steady_prior(F: Array, H: Array, Q: Array, R: Array) -> Array:
+    """Covariance before a measurement that the Kalman filter's recursion settles at.
+
+    Parameters
+    ----------
+    F, H, Q, R
+        (n, n), (p, n), (n, n), (p, p); R positive definite.
+
+    Returns
+    -------
+    ndarray
+        (n, n), symmetric.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If there is none: some state grows or wanders and no measurement tells of it.
+    """
+    informed = H.T @ np.linalg.solve(R, H)
+    scale = np.sqrt(np.diag(Q))
+    scale[scale == 0.0] = 1.0
+    # SI units lie many decades apart. The first pass finds how large each state's uncertainty is, the second works
+    # in these units.
+    for _ in range(2):
+        units = np.outer(scale, scale)
+        A, G, X = np.ascontiguousarray((F / scale[:, None] * scale).T), informed * units, Q / units
+        settled = double(A, G, X)
+        if not settled or not np.all(np.diag(X) >= 0.0):  # which no number is not
+            raise np.linalg.LinAlgError(
+                "no steady covariance: a state grows or wanders that no measurement tells of"
+            )
+        X *= units
+        std = np.sqrt(np.diag(X))
+        scale = np.where(std > 0.0, std, scale)
+    X = 0.5 * (X + X.T)
+    # One step of the recursion itself takes off what rounding left in all that settles fast.
+    refined = riccati_step(F, H, Q, R, X)
+    return np.asarray(0.5 * (refined + refined.T))
+
+
+def riccati_step(F: Array, H: Array, Q: Array, R: Array, prior: Array) -> Array:
+    """One sample of the recursion whose steady state `steady_prior` is."""
+    residual = H @ prior @ H.T + R
+    gain = np.linalg.solve(residual, H @ prior).T
+    kept = np.eye(len(F)) - gain @ H
+    return np.asarray(F @ (kept @ prior @ kept.T + gain @ R @ gain.T) @ F.T + Q)
+
+
+@kernel
+def double(A: Array, G: Array, X: Array) -> bool:
+    """Doubling iteration for ``X = A' X (I + G X)^-1 A + X0``, in place; whether it settled.
+
+    Parameters
+    ----------
+    A, G
+        (n, n) F' and H' R^-1 H; used up.
+    X
+        (n, n) Q; on return, the solution.
+    """
+    n = len(A)
+    W, both, half = np.empty((n, n)), np.empty((n, 2 * n)), np.empty((n, n))
+    right, fresh = np.empty((n, n)), np.empty((n, n))
+    for _ in range(MAX_DOUBLINGS):
+        # W = I + G X; left = W^-1 A and right = W^-1 G A' in one go.
+        multiply(G, X, W)
+        multiply_transposed(G, A, half)
+        for i in range(n):
+            W[i, i] += 1.0
+            for j in range(n):
+                both[i, j], both[i, n + j] = A[i, j], half[i, j]
+        if not solve_in_place(W, both):
+            return False
+        # X + A' X left, through the columns of A.
+        left = both[:, :n]
+        multiply(X, left, half)
+        largest, change = 0.0, 0.0
+        for i in range(n):
+            for j in range(n):
+                total = 0.0
+                for q in range(n):
+                    total += A[q, i] * half[q, j]
+                fresh[i, j] = total
+        for i in range(n):
+            for j in range(n):
+                step = 0.5 * (fresh[i, j] + fresh[j, i])
+                X[i, j] += step
+                change, largest = max(change, abs(step)), max(largest, abs(X[i, j]))
+        if not largest < np.inf:
+            return False
+        if change <= 1e-16 * largest:
+            return True
+        # G + A right and A left.
+        for i in range(n):
+            for j in range(n):
+                right[i, j] = both[i, n + j]
+        multiply(A, right, half)
+        multiply(A, left, fresh)
+        for i in range(n):
+            for j in range(n):
+                G[i, j] += 0.5 * (half[i, j] + half[j, i])
+                A[i, j] = fresh[i, j]
+    return False
