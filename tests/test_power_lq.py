@@ -12,7 +12,6 @@ from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import differential_evolution
 
 from tuning.excited import ExcitedPlant, balance, excited_plant
-from tuning.limit import least_motion_closed_form
 from tuning.lq_kernels import double, excited_covariance, excited_sine, joint_moments, solve_care
 from tuning.power_lq import LQDesign, PowerBudgetedLQ
 from twin.control.lq import force_model
@@ -53,10 +52,8 @@ def physical_limit(plant: Plant, hz: float, amplitude: float, watt: float) -> fl
     inputs = np.column_stack([excited.b[:n], math.sqrt(2.0) * excited.A[:n, n + 1]])
     answer = np.linalg.solve(1j * math.tau * hz * np.eye(n) - excited.A[:n, :n], inputs)
     per_newton, alone = excited.motion[:n] @ answer
-    k, ohm = excited.coil.force_constant_n_a, excited.coil.resistance_ohm
-    return least_motion_closed_form(
-        (complex(per_newton) * k, complex(alone)), (1.0 + 0.0j, 0.0j), math.sqrt(2.0 * watt / ohm)
-    )
+    most = excited.coil.force_constant_n_a * math.sqrt(2.0 * watt / excited.coil.resistance_ohm)
+    return max(0.0, float(abs(alone)) - float(abs(per_newton)) * most)
 
 
 # --- the model and its kernels ------------------------------------------------------------------------------
