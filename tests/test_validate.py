@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from estimators.absorber_fit import fit_absorber
+from estimators.fits.added_mass import fit_absorber
 from twin.plant.errors import InputError
 from twin.station.cli import app
 from twin.station.validate import run_validation

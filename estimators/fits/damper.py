@@ -276,9 +276,13 @@ def _explained(r: DamperRecord, residual: Array) -> float:
         known = blocks % 2 == part
         c = np.linalg.lstsq(features[known], residual[known], rcond=1e-8)[0]
         predicted[~known] = features[~known] @ c
-    # The product keeps only what both sides share: noise that was fitted by chance cancels on average.
-    shared = float(np.mean(predicted * residual))
-    return float(np.sqrt(max(shared, 0.0)))
+    # The product keeps only what both sides share: noise that was fitted by chance cancels on average, and what is
+    # left of it shows in how the blocks differ.
+    product = predicted * residual
+    each = np.array([np.mean(product[blocks == b]) for b in range(8)])
+    if np.mean(each) < 3.0 * np.std(each, ddof=1) / np.sqrt(8.0):
+        return 0.0
+    return float(np.sqrt(max(float(np.mean(product)), 0.0)))
 
 
 def _with_friction(r: DamperRecord, linear: Array) -> tuple[Estimate, Estimate, float, Array]:

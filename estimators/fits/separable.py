@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from twin.plant.linear import Array
@@ -132,12 +131,11 @@ def _project(matrix: Array, y: Array) -> tuple[Array, Array]:
     gram = scaled.T @ scaled
     if np.linalg.eigvalsh(gram)[0] > 1e-9:
         # Well conditioned: two rounds of Cholesky are as good as a QR and several times faster.
-        lower = np.linalg.cholesky(gram)
-        span = solve_triangular(lower, scaled.T, lower=True).T
-        again = np.linalg.cholesky(span.T @ span)
-        span = solve_triangular(again, span.T, lower=True).T
-        inside = solve_triangular(again, span.T @ y, lower=True, trans="T")
-        return span, solve_triangular(lower, inside, lower=True, trans="T") / size
+        first = np.linalg.inv(np.linalg.cholesky(gram)).T
+        span = scaled @ first
+        second = np.linalg.inv(np.linalg.cholesky(span.T @ span)).T
+        span = span @ second
+        return span, first @ (second @ (span.T @ y)) / size
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(s > 1e-11 * s[0]))
     return u[:, :rank], vt[:rank].T @ (u[:, :rank].T @ y / s[:rank]) / size

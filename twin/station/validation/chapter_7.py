@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from estimators.absorber_fit import AbsorberFit, fit_absorber
+from estimators.fits.added_mass import AbsorberFit, fit_absorber
 from twin.control.analysis import OperatingPoint, analyse_point, choose_law
 from twin.control.delay import growth_rate_1_s
 from twin.control.filters import (
