@@ -119,6 +119,10 @@ def map_channels(
             found[name] = (ArrayRef(name), "equal names")
         else:
             missing.append(name)
+    for name in [m for m in missing if _measured_drive(plant, m, found)]:
+        measured = _measured_drive(plant, name, found)
+        missing.remove(name)
+        notes.append(f"{name}: its command is not recorded; '{measured}' tells what drove it")
     time = beside.time.array if beside.time else None
     free = [
         a for a in arrays if a not in (*TIME_NAMES, time) and a not in {r.array for r, _ in found.values()}
@@ -142,6 +146,12 @@ def map_channels(
         if name in found
     )
     return mapping, tuple(notes)
+
+
+def _measured_drive(plant: Plant, actuator: str, found: Mapping[str, object]) -> str:
+    """Sensor that measured what drove an actuator; empty if none did, or it is no actuator."""
+    measured = (s for s in plant.sensor if s.of == actuator and s.kind in ("voltage", "current"))
+    return next((s.name for s in measured if s.name in found), "")
 
 
 def _guess(

@@ -64,6 +64,11 @@ class Recording:
     _in_order: bool
     _notes: dict[str, list[tuple[int, str]]] = field(repr=False)
 
+    @property
+    def source(self) -> Path:
+        """The file that is read: the given one, or the whole part of it where that was cut short."""
+        return self._source
+
     def blocks(self) -> Iterator[Block]:
         """Blocks as they were recorded, by first sample; a few at a time in memory unless they lie out of order.
 
