@@ -2,7 +2,10 @@
 
     minimise |phi g - target|²   subject to   Re(e^{-j p_k} (1 + L_k g)) >= M   on a frequency grid
 
-The loop gain is linear in the gains, so each row is affine; a few rounds move the p_k to arg(1 + L_k).
+The loop gain is linear in the gains, so each row is affine; a few rounds move the p_k to arg(1 + L_k). Few of a
+grid's rows ever bind: each round takes those that are nearest to -1, together with those that bound the last one, so
+the program has `ROWS` of them whatever the grid. It makes the starting point of a `search`, which then looks at the
+motion itself and at every other limit.
 """
 
 import numpy as np
@@ -13,6 +16,7 @@ from scipy import sparse
 from twin.plant.errors import RunError
 from twin.plant.linear import Array, ComplexArray
 
+ROWS, KEPT = 20, 6
 ROUNDS = 8
 PROXIMAL = 0.1
 REGULARITY = 1e-9
@@ -20,22 +24,20 @@ RHO = 0.1
 
 
 class GainProgram:
-    """The quadratic program for one number of grid points; set up once, updated and warm-started after.
+    """The quadratic program; set up once, updated and warm-started after.
 
     Parameters
     ----------
-    rows
-        Grid points of the margin constraint.
     scale
         (3,) typical size of alpha, beta, gamma [kg, Ns/m, N/m]: what the solver sees is of order one.
     bounds
         (3, 2) lower and upper bound of each gain in SI units.
     """
 
-    def __init__(self, rows: int, scale: Array, bounds: Array) -> None:
-        self._rows, self._scale = rows, scale
+    def __init__(self, scale: Array, bounds: Array) -> None:
+        self._scale = scale
         self._bounds = bounds / scale[:, None]
-        self._multipliers = np.zeros(rows + 3)
+        self._multipliers = np.zeros(ROWS + 3)
         self._solver: osqp.OSQP | None = None
 
     def solve(
@@ -50,7 +52,7 @@ class GainProgram:
         target
             The wanted reference [A].
         terms
-            (rows, 3) loop gain per unit of each gain.
+            (n, 3) loop gain per unit of each gain on a grid of any length from `ROWS`.
         modulus_margin
             Least |1 + L| on the grid.
         start
@@ -77,15 +79,18 @@ class GainProgram:
         hessian = 2.0 * (stacked.T @ stacked + PROXIMAL * np.eye(3))
         pull = -2.0 * stacked.T @ np.array([wanted.real, wanted.imag])
         y = np.linalg.solve(basis, start / self._scale)
-        self._multipliers = np.zeros(self._rows + 3)  # those of the last question would colour this answer
+        self._multipliers = np.zeros(ROWS + 3)  # those of the last question would colour this answer
+        kept = np.zeros(0, dtype=np.int64)
         for _ in range(ROUNDS):
             one_plus = 1.0 + scaled @ y
-            turn = np.exp(-1j * np.angle(one_plus))
-            matrix = np.vstack([(turn[:, None] * scaled).real, basis])
+            rows = _nearest(np.abs(one_plus), kept)
+            turn = np.exp(-1j * np.angle(one_plus[rows]))
+            matrix = np.vstack([(turn[:, None] * scaled[rows]).real, basis])
             lower = np.concatenate([modulus_margin - turn.real, self._bounds[:, 0]])
-            upper = np.concatenate([np.full(self._rows, np.inf), self._bounds[:, 1]])
+            upper = np.concatenate([np.full(ROWS, np.inf), self._bounds[:, 1]])
             linear = pull - 2.0 * PROXIMAL * y
             previous, y = y, self._step(hessian, linear, matrix, lower, upper, y)
+            kept = rows[np.argsort(self._multipliers[:ROWS], kind="stable")[:KEPT]]
             if np.max(np.abs(y - previous)) < 1e-4:
                 break
         return np.asarray(basis @ y * self._scale)
@@ -112,7 +117,8 @@ class GainProgram:
             )  # fmt: skip
         # Also after setup, so that the first question is answered to the same bits as when it is asked again.
         self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
-        self._solver.warm_start(x=warm, y=self._multipliers)
+        # Rows change places from round to round: their multipliers are no start for each other.
+        self._solver.warm_start(x=warm, y=np.zeros(ROWS + 3))
         result = self._solver.solve(raise_error=False)
         if result.info.status_val not in (
             osqp.SolverStatus.OSQP_SOLVED,
@@ -121,3 +127,14 @@ class GainProgram:
             raise RunError(f"no gains keep the margin ({result.info.status})")
         self._multipliers = np.asarray(result.y, dtype=np.float64)
         return np.asarray(result.x, dtype=np.float64)
+
+
+def _nearest(distance: Array, kept: NDArray[np.int64]) -> NDArray[np.int64]:
+    """`ROWS` rows in rising order: those kept, the bottoms of all valleys, and what is nearest to -1 then."""
+    inner = np.zeros(len(distance), dtype=np.bool_)
+    inner[1:-1] = (distance[1:-1] <= distance[:-2]) & (distance[1:-1] < distance[2:])
+    bottoms = np.nonzero(inner)[0]
+    bottoms = bottoms[np.argsort(distance[bottoms], kind="stable")][: ROWS - KEPT]
+    order = np.concatenate([kept, bottoms, np.argsort(distance, kind="stable")])
+    _, first = np.unique(order, return_index=True)
+    return np.sort(order[np.sort(first)[:ROWS]])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import control
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
+from scipy.linalg import eig, expm
 
 from twin.control.chain import CHAIN_STATES, chain_matrices, chain_response
 from twin.control.schedule import Gains
@@ -280,18 +280,21 @@ class RigModel:
             (count,) real parts, the largest first, one of each pair; (count, 3) their slopes over alpha, beta, gamma.
         """
         n, fs, k = len(self._late), self.facts.sample_rate_hz, self.coil.force_constant_n_a
-        poles, right = np.linalg.eig(self.closed_loop_matrix(gains))
-        left = np.linalg.inv(right)
+        found: tuple[ComplexArray, ...] = eig(self.closed_loop_matrix(gains), left=True, right=True)
+        poles, left, right = found[0], found[1], found[2]
+        overlap = np.einsum("ij,ij->j", left.conj(), right)
+        # A pole on top of another has no slope of its own.
+        share = np.where(np.abs(overlap) > 1e-7, 1.0 / np.where(overlap == 0.0, 1.0, overlap), 0.0)
         order = np.argsort(-np.abs(poles), kind="stable")
         chosen = [int(j) for j in order if poles[j].imag >= 0.0][:count]
         _, _, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, fs)
         line = n + CHAIN_STATES
         # The gains stand in the command alone: per unit, what each state adds to it, and where it goes.
         commands = (D * self._rows[2] @ right[:n] + C @ right[n:line]) / k
-        enters = left[:, line] if len(poles) > line else np.zeros(len(poles), dtype=np.complex128)
+        enters = left[line].conj() if len(poles) > line else np.zeros(len(poles), dtype=np.complex128)
         if self.facts.delay_samples == 0:
-            enters = enters + left[:, :n] @ self._late
-        turns = enters[chosen, None] * commands.T[chosen] / poles[chosen, None]
+            enters = enters + self._late @ left[:n].conj()
+        turns = (enters * share)[chosen, None] * commands.T[chosen] / poles[chosen, None]
         return np.log(np.abs(poles[chosen])) * fs, np.asarray(turns.real * fs)
 
     @property
@@ -338,7 +341,10 @@ def loop_margins(L: ComplexArray, frequency_hz: Array, longest_delay_s: float = 
     frequency_hz
         (n,) ascending [Hz].
     """
-    modulus = float(np.min(np.abs(1.0 + L)))
+    # Least distance from -1 to the chords between the grid's points, not to the points alone.
+    chord = np.diff(L)
+    along = -(chord.conj() * (1.0 + L[:-1])).real / np.maximum(np.abs(chord) ** 2, 1e-300)
+    modulus = float(np.min(np.abs(1.0 + L[:-1] + np.clip(along, 0.0, 1.0) * chord)))
     size = np.abs(L) - 1.0
     crossing = np.nonzero(size[:-1] * size[1:] < 0.0)[0]
     best = math.inf
@@ -348,6 +354,22 @@ def loop_margins(L: ComplexArray, frequency_hz: Array, longest_delay_s: float = 
         angle = np.angle(L[k] + share * (L[k + 1] - L[k])) + math.pi
         best = min(best, float(angle % math.tau) / (math.tau * f))
     return Margins(modulus, best if best < longest_delay_s else None)
+
+
+def mode_grid(model: RigModel, points: int) -> Array:
+    """Frequency grid [Hz] for a model's loop: the whole band, and each mode as densely as it is sharp.
+
+    Parameters
+    ----------
+    points
+        On either side of each mode, and half as many again as both sides of one over the whole band.
+    """
+    parts = [np.geomspace(0.3, 0.49 * model.facts.sample_rate_hz, 3 * points)]
+    for frequency, width in model.modes_hz:
+        off = np.geomspace(0.1 * min(width, frequency), 0.6 * frequency, points)
+        parts += [frequency + off, frequency - off, np.array([frequency])]
+    grid = np.unique(np.concatenate(parts))
+    return grid[(grid > 0.0) & (grid < 0.495 * model.facts.sample_rate_hz)]
 
 
 def margin_grid(sample_rate_hz: float, modes_hz: ArrayLike, points: int) -> Array:

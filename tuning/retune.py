@@ -1,27 +1,32 @@
 """Verify, then propose: gains for the operating points around the present excitation, inside a power budget.
 
-Per point: the physical limit (`limit`), the gains of the rig's own law nearest to it with a modulus margin
-(`gains`), and then, from the deployed numbers alone on the full sampled model, everything a proposal states:
-poles, margins, motion, powers, at the excitation and beside it, at the damping and two standard deviations off.
+Per point: the physical limit (`limit`), the gains of the rig's own law that come nearest to it (`search`), and then,
+from the deployed numbers alone on the full sampled model, everything a proposal states (`verify`). Gains in use that
+keep all of it stay unless the new ones are better by more than a stated amount.
 """
 
 import math
+import re
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from tuning.gains import GainProgram
-from tuning.limit import CoilLimits, LimitProblem, LimitResult
-from tuning.loop import LoopFacts, Margins, RigModel, margin_grid, margins
-from tuning.types import BudgetKind, OperatingPoint, Powers, Proposal
+from tuning.design import Designer
+from tuning.limit import CoilLimits, LimitResult, least_power, physical_limit
+from tuning.loop import LoopFacts, Margins
+from tuning.steady import Prediction, SteadyPaths, predict
+from tuning.types import ActiveLimit, BudgetKind, OperatingPoint, Proposal, Refusal
+from tuning.verify import Demands, Situation, Verdict, verify
 from twin.control.schedule import Gains, GainSchedule
 from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
-from twin.plant.linear import ComplexArray, natural_frequencies_hz
+
+__all__ = ["Prediction", "Retuner", "TuningGoal", "predict"]
 
 SAME_DAMPING_NS_M = 0.06
 SAME_AMPLITUDE = 5e-3
 """A point is not solved again for changes smaller than these: gains would move by less than a thousandth."""
+
+BETTER_SHARE, BETTER_OF_PASSIVE = 0.01, 1e-3
+"""New gains replace sound ones in use only for so much less motion, of what is left and of the passive one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +36,8 @@ class TuningGoal:
     Attributes
     ----------
     budget_w, budget_kind
-        Coil power that may be spent, and which power that is: ``joule_mean`` is R i_rms², ``joule_peak`` R i_peak².
+        Coil power that may be spent, and which power that is: ``joule_mean`` is R i_rms², ``joule_peak`` R i_peak²,
+        ``electrical`` the mean of v i at the coil's terminals.
     modulus_margin
         Least distance of the loop gain from -1.
     reach_hz
@@ -40,6 +46,10 @@ class TuningGoal:
         The budget holds with the excitation this much off the point's.
     slowest_decay_1_s
         Every closed-loop pole decays at least this fast.
+    delay_margin_s
+        Further delay the loop must stand, beside its own [s].
+    displacement_m
+        Primary motion that is enough [m]: reached with the least power, instead of the least motion for the budget.
     """
 
     budget_w: float = 4.0
@@ -48,21 +58,15 @@ class TuningGoal:
     reach_hz: float = 1.0
     drift_hz: float = 0.25
     slowest_decay_1_s: float = 0.5
+    delay_margin_s: float = 0.0
+    displacement_m: float | None = None
 
     @property
     def joule_mean_w(self) -> float:
-        """The budget as mean Joule power: half of the peak for a sine."""
+        """The budget as mean Joule power, half of the peak for a sine; infinite if it bounds another power."""
+        if self.budget_kind == "electrical":
+            return math.inf
         return 0.5 * self.budget_w if self.budget_kind == "joule_peak" else self.budget_w
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """Steady state of one set of gains at one frequency on one model."""
-
-    displacement_m: float
-    stroke_m: float
-    current_peak_a: float
-    powers: Powers
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,14 @@ class _Solved:
         )
 
 
+class NoGainsError(RunError):
+    """No gains may be proposed at a point."""
+
+    def __init__(self, reason: str, binding: tuple[str, ...], least_budget_w: float | None = None) -> None:
+        super().__init__(reason)
+        self.binding, self.least_budget_w = binding, least_budget_w
+
+
 class Retuner:
     """Propose gains for the points of a schedule's table.
 
@@ -106,8 +118,6 @@ class Retuner:
         Sampling and delay of the rig's loop.
     goal
         Budget and margin.
-    limit
-        Compiled limit problem of another tuner in the same thread, to share; a new one takes a while to set up.
 
     Raises
     ------
@@ -115,36 +125,28 @@ class Retuner:
         If the plant states no limit on the coil's current or stroke: without them nothing may be proposed.
     """
 
-    def __init__(
-        self, plant: Plant, facts: LoopFacts, goal: TuningGoal, limit: LimitProblem | None = None
-    ) -> None:
-        coil, absorber = plant.voice_coil, plant.absorber
-        if coil is None or absorber is None:
-            raise InputError(
-                f"plant '{plant.name}' has no voice coil on an absorber: there is nothing to retune"
-            )
-        current = f"{coil.name}_current_a"
-        for key in (current, "stroke_m"):
-            if key not in plant.limits:
-                raise InputError(
-                    f"plant '{plant.name}': limits.{key} [{plant.limit_units[key]}] is missing; without it no gains "
-                    "are proposed; add it to the plant file"
-                )
-        if not goal.budget_w > 0.0:
-            raise InputError(f"budget_w must be greater than 0 W, got {goal.budget_w}")
+    def __init__(self, plant: Plant, facts: LoopFacts, goal: TuningGoal) -> None:
+        _check(plant, goal)
+        coil = plant.voice_coil
+        if coil is None:
+            raise InputError(f"plant '{plant.name}' has no voice coil")
         self.plant, self.facts, self.goal = plant, facts, goal
-        self._coil = coil
-        power = min(goal.joule_mean_w, plant.limits.get(f"{coil.name}_power_w", math.inf))
-        self._limits = CoilLimits(power, plant.limits[current], plant.limits["stroke_m"], coil.resistance_ohm)
-        self._limit = limit or LimitProblem()
-        modes = natural_frequencies_hz(plant)
-        self._check_grid = margin_grid(facts.sample_rate_hz, modes, 200)
-        self._design_rows = slice(None, None, 4)
-        w2 = math.sqrt(absorber.stiffness_n_m / absorber.mass_kg)
-        scale = np.array([absorber.mass_kg, absorber.mass_kg * w2, absorber.stiffness_n_m])
-        # gamma > -k2, alpha > -m2, beta free (thesis 6.2.3), with room to the bounds.
-        bounds = np.array([[-0.5, 1.0], [-1.0, 1.0], [-0.8, 2.0]]) * scale[:, None]
-        self._program = GainProgram(len(self._check_grid[self._design_rows]), scale, bounds)
+        self._limits = CoilLimits(
+            joule_mean_w=min(goal.joule_mean_w, plant.limits.get(f"{coil.name}_power_w", math.inf)),
+            current_peak_a=plant.limits[f"{coil.name}_current_a"],
+            stroke_m=plant.limits["stroke_m"],
+            resistance_ohm=coil.resistance_ohm,
+            voltage_peak_v=plant.limits.get(f"{coil.name}_voltage_v", math.inf),
+            electrical_mean_w=goal.budget_w if goal.budget_kind == "electrical" else math.inf,
+        )
+        self._demands = Demands(
+            self._limits,
+            goal.modulus_margin,
+            goal.delay_margin_s,
+            goal.slowest_decay_1_s,
+            goal.displacement_m,
+        )
+        self._designer = Designer(plant)
         self._solved: dict[int, _Solved] = {}
 
     def propose(
@@ -176,25 +178,28 @@ class Retuner:
         """
         low, high = sorted((excitation_hz, excitation_hz + ahead_hz))
         points: list[tuple[int, OperatingPoint]] = []
-        troubles: list[str] = []
+        refusals: list[tuple[int, Refusal]] = []
         for row, frequency in enumerate(schedule.frequency_hz):
             if not low - self.goal.reach_hz <= frequency <= high + self.goal.reach_hz:
                 continue
-            question = self._question(plant, damping_std_ns_m, frequency, excitation_amplitude, schedule)
+            in_use = schedule.at(frequency)
+            question = _question(plant, damping_std_ns_m, frequency, excitation_amplitude, in_use)
             known = self._solved.get(row)
-            if known is not None and known.answers(question):
-                points.append((row, known.point))
-                continue
             try:
-                point = self._tune(
-                    plant, damping_std_ns_m, frequency, excitation_amplitude, schedule.at(frequency)
-                )
-                points.append((row, point))
-                self._solved[row] = _Solved(question, point)
-            except RunError as error:
-                troubles.append(f"{frequency:g} Hz: {error}")
-        reason = "; ".join(troubles)
-        if not points and not troubles:
+                if known is not None and known.answers(question):
+                    point = known.point
+                else:
+                    point = self.point(plant, damping_std_ns_m, frequency, excitation_amplitude, in_use)
+                    self._solved[row] = _Solved(question, point)
+            except NoGainsError as error:
+                reason = f"{frequency:g} Hz: {error}"
+                refusals.append((row, Refusal(frequency, error.binding, reason, error.least_budget_w)))
+                continue
+            points.append(
+                (row, self._or_in_use(plant, damping_std_ns_m, excitation_amplitude, in_use, point))
+            )
+        reason = "; ".join(r.reason for _, r in refusals)
+        if not points and not refusals:
             reason = f"no point of the table lies within {self.goal.reach_hz:g} Hz of {excitation_hz:.2f} Hz"
         return Proposal(
             made_at_sample=sample,
@@ -204,144 +209,221 @@ class Retuner:
             budget_w=self.goal.budget_w,
             budget_kind=self.goal.budget_kind,
             points=tuple(points),
-        )
-
-    @staticmethod
-    def _question(
-        plant: Plant, damping_std: float, frequency: float, amplitude: float, schedule: GainSchedule
-    ) -> "_Question":
-        absorber = plant.absorber
-        gains = schedule.at(frequency)
-        return _Question(
-            frequency_hz=frequency,
-            damping_ns_m=absorber.damping_at(frequency) if absorber is not None else 0.0,
-            damping_std_ns_m=damping_std,
-            amplitude=amplitude,
-            cutoffs_hz=(gains.low_pass_hz, gains.high_pass_hz),
+            refusals=tuple(refusals),
         )
 
     def limit_at(self, plant: Plant, frequency_hz: float, amplitude: float) -> LimitResult:
-        """Physical limit at one frequency; see `LimitProblem.solve`."""
-        model = RigModel(plant, self.facts, frequency_hz)
-        return self._solve_limit(model.response(frequency_hz)[0], amplitude, self._limits)
+        """Physical limit at one frequency.
 
-    def _solve_limit(self, response: ComplexArray, amplitude: float, limits: CoilLimits) -> LimitResult:
-        motion, stroke, _, current = ((complex(row[0]), complex(row[1]) * amplitude) for row in response)
-        return self._limit.solve(motion, current, stroke, limits)
+        Raises
+        ------
+        RunError
+            If no current keeps the limits.
+        """
+        situation = Situation(plant, self.facts, frequency_hz, amplitude, 0.0, 0.0)
+        return physical_limit(situation.paths, self._limits)
 
-    def _tune(
-        self, plant: Plant, damping_std: float, frequency: float, amplitude: float, in_use: Gains
+    def point(
+        self, plant: Plant, damping_std_ns_m: float, frequency_hz: float, amplitude: float, in_use: Gains
     ) -> OperatingPoint:
-        absorber = plant.absorber
-        damping = absorber.damping_at(frequency) if absorber is not None else 0.0
-        model = RigModel(plant, self.facts, frequency)
-        response = model.response(frequency)[0]
+        """Verified gains for one operating point, with the cutoffs of those in use.
+
+        Parameters
+        ----------
+        plant, damping_std_ns_m, frequency_hz, amplitude
+            As `propose`.
+        in_use
+            Gives the cutoffs; its gains do not matter here.
+
+        Raises
+        ------
+        NoGainsError
+            If nothing may be proposed; it names what binds, and the least budget that would do.
+        """
+        situation = self._situation(plant, damping_std_ns_m, frequency_hz, amplitude)
+        try:
+            best = physical_limit(situation.paths, self._limits)
+        except RunError as error:
+            raise self._without_a_limit(situation, str(error)) from error
         cutoffs = in_use.low_pass_hz, in_use.high_pass_hz
-        path = model.paths(frequency, in_use.low_pass_hz, in_use.high_pass_hz)[0]
-        low, high = max(0.0, damping - 2.0 * damping_std), damping + 2.0 * damping_std
-        models = [model, *(RigModel(plant, self.facts, frequency, c) for c in (low, high))]
-        loops = [m.loop_terms(self._check_grid, *cutoffs) for m in models]
-        terms = loops[0][self._design_rows]
-
-        limits, margin = self._limits, self.goal.modulus_margin
-        best = self._solve_limit(response, amplitude, limits)
-        trouble = ""
-        for _ in range(4):
-            wanted = best if limits is self._limits else self._solve_limit(response, amplitude, limits)
-            acceleration = response[2, 0] * wanted.reference_a + response[2, 1] * amplitude
-            numbers = self._program.solve(path * acceleration, wanted.reference_a, terms, margin, np.zeros(3))
-            gains = replace(
-                in_use, alpha_kg=float(numbers[0]), beta_ns_m=float(numbers[1]), gamma_n_m=float(numbers[2])
+        wanted = self.goal.displacement_m
+        if wanted is not None and wanted < best.displacement_m:
+            reason = f"displacement {1e6 * wanted:.4g} µm: no linear controller leaves less than "
+            reason += f"{1e6 * best.displacement_m:.4g} µm inside the limits"
+            names = tuple(a.name for a in best.active)
+            raise self._unsolved(
+                situation, cutoffs, best, Verdict(reason, "displacement", Margins(0.0, None), 0.0, ()), names
             )
-            trouble, found = self._verify(models, loops, gains, frequency, amplitude)
-            if not trouble:
-                prediction = predict(model, gains, frequency, amplitude)
-                return OperatingPoint(
-                    frequency_hz=frequency,
-                    gains=gains,
-                    predicted_displacement_m=prediction.displacement_m,
-                    passive_displacement_m=abs(response[0, 1]) * amplitude,
-                    limit_displacement_m=best.displacement_m,
-                    stroke_m=prediction.stroke_m,
-                    current_peak_a=prediction.current_peak_a,
-                    powers=prediction.powers,
-                    modulus_margin=found.modulus,
-                    delay_margin_s=found.delay_s,
-                    active_limits=best.active,
-                )
-            if trouble.startswith(("power", "current", "stroke")):
-                limits = replace(
-                    limits,
-                    joule_mean_w=0.8 * limits.joule_mean_w,
-                    current_peak_a=0.9 * limits.current_peak_a,
-                    stroke_m=0.9 * limits.stroke_m,
-                )
-            else:
-                # Ask for more by what was missing: between the grid's points, or at the other dampings.
-                margin = min(0.9, margin + max(0.01, 1.5 * (self.goal.modulus_margin - found.modulus)))
-        raise RunError(trouble)
+        design = self._designer.design(situation, cutoffs, self._demands, best.reference_a)
+        verdict = verify(situation, design.gains, self._demands)
+        if verdict.trouble:
+            raise self._unsolved(situation, cutoffs, best, verdict)
+        active = (*best.active, *design.active)
+        return self._describe(situation, design.gains, best, verdict, active, kept=False)
 
-    def _verify(
+    def _situation(self, plant: Plant, std: float, frequency: float, amplitude: float) -> Situation:
+        return Situation(plant, self.facts, frequency, amplitude, std, self.goal.drift_hz)
+
+    def _describe(
         self,
-        models: list[RigModel],
-        loops: list[ComplexArray],
+        situation: Situation,
         gains: Gains,
-        frequency: float,
-        amplitude: float,
-    ) -> tuple[str, Margins]:
-        """What is wrong with these gains (empty: nothing), and the least margins found."""
-        goal, least = self.goal, Margins(math.inf, None)
-        for candidate, terms in zip(models, loops, strict=True):
-            decay = candidate.decay_rate_1_s(gains)
-            if not decay < -goal.slowest_decay_1_s:
-                return (
-                    f"slowest pole at {decay:+.2f} 1/s, wanted below -{goal.slowest_decay_1_s:g} 1/s",
-                    least,
-                )
-            found = margins(terms, self._check_grid, gains)
-            delay = min((d for d in (found.delay_s, least.delay_s) if d is not None), default=None)
-            least = Margins(min(found.modulus, least.modulus), delay)
-        if least.modulus < 0.95 * goal.modulus_margin:
-            return f"modulus margin {least.modulus:.3f}, wanted {goal.modulus_margin:g}", least
-        for f in (frequency - goal.drift_hz, frequency, frequency + goal.drift_hz):
-            p = predict(models[0], gains, f, amplitude)
-            if p.powers.joule_mean_w > self._limits.joule_mean_w * 1.001:
-                return (
-                    f"power {p.powers.joule_mean_w:.2f} W mean Joule at {f:.2f} Hz is over the budget",
-                    least,
-                )
-            if p.current_peak_a > self._limits.current_peak_a * 1.001:
-                return f"current {p.current_peak_a:.2f} A at {f:.2f} Hz is over the limit", least
-            if p.stroke_m > self._limits.stroke_m * 1.001:
-                return f"stroke {p.stroke_m * 1e3:.2f} mm at {f:.2f} Hz is over the limit", least
-        return "", least
+        best: LimitResult,
+        verdict: Verdict,
+        active: tuple[ActiveLimit, ...],
+        *,
+        kept: bool,
+    ) -> OperatingPoint:
+        p, kind = verdict.predictions[0], self.goal.budget_kind
+        # The excitation's own frequency on every model: what not knowing the damping leaves open.
+        alike = [
+            q
+            for (_, paths), q in zip(situation.cases, verdict.predictions, strict=True)
+            if paths.frequency_hz == situation.frequency_hz
+        ]
+        sizes = [q.displacement_m for q in alike]
+        spent = [q.powers.of_kind(kind) for q in alike]
+        least = None
+        if self.goal.displacement_m is not None:
+            least = least_power(situation.paths, self._limits, self.goal.displacement_m, kind).power_w
+        return OperatingPoint(
+            frequency_hz=situation.frequency_hz,
+            gains=gains,
+            predicted_displacement_m=p.displacement_m,
+            passive_displacement_m=abs(situation.paths.motion[1]),
+            limit_displacement_m=best.displacement_m,
+            stroke_m=p.stroke_m,
+            current_peak_a=p.current_peak_a,
+            powers=p.powers,
+            modulus_margin=verdict.margins.modulus,
+            delay_margin_s=verdict.margins.delay_s,
+            active_limits=active,
+            voltage_peak_v=p.voltage_peak_v,
+            decay_rate_1_s=verdict.decay_rate_1_s,
+            damping_std_ns_m=situation.damping_std_ns_m,
+            displacement_range_m=(min(sizes), max(sizes)),
+            power_range_w=(min(spent), max(spent)),
+            kept=kept,
+            least_power_w=least,
+        )
+
+    def _or_in_use(
+        self, plant: Plant, std: float, amplitude: float, in_use: Gains, point: OperatingPoint
+    ) -> OperatingPoint:
+        """Return the point or, if they are sound and hardly worse, the gains in use with what is predicted of them."""
+        if in_use == point.gains:
+            return replace(point, kept=True)
+        situation = self._situation(plant, std, point.frequency_hz, amplitude)
+        verdict = verify(situation, in_use, self._demands)
+        if verdict.trouble:
+            return point
+        now, new = (
+            verdict.predictions[0],
+            predict(situation.models[0], point.gains, point.frequency_hz, amplitude),
+        )
+        if self.goal.displacement_m is None:
+            gained = now.displacement_m - new.displacement_m
+            enough = BETTER_SHARE * now.displacement_m, BETTER_OF_PASSIVE * abs(situation.paths.motion[1])
+        else:
+            kind = self.goal.budget_kind
+            gained = now.powers.of_kind(kind) - new.powers.of_kind(kind)
+            enough = BETTER_SHARE * abs(now.powers.of_kind(kind)), BETTER_OF_PASSIVE * self.goal.budget_w
+        if gained > max(enough):
+            return point
+        best = LimitResult(0j, point.limit_displacement_m, ())
+        return self._describe(situation, in_use, best, verdict, point.active_limits, kept=True)
+
+    def _without_a_limit(self, situation: Situation, reason: str) -> NoGainsError:
+        """The limits exclude each other: say which, and what power would do."""
+        names = tuple(re.split(r" and |, ", reason.split(":", maxsplit=1)[0]))
+        needed = self._least_for_limits(situation.paths, math.inf)
+        return NoGainsError(reason + self._remedy(needed), names, needed)
+
+    def _least_for_limits(self, paths: SteadyPaths, displacement_m: float) -> float | None:
+        try:
+            found = least_power(paths, self._limits, displacement_m, self.goal.budget_kind)
+        except RunError:
+            return None
+        return found.power_w
+
+    def _unsolved(
+        self,
+        situation: Situation,
+        cutoffs: tuple[float, float],
+        best: LimitResult,
+        verdict: Verdict,
+        binding: tuple[str, ...] = (),
+    ) -> NoGainsError:
+        """No gains of the law keep everything: say what binds, and the least budget with which some do."""
+        if verdict.broken not in ("power", "electrical", "displacement", "stroke", "current", "voltage"):
+            return NoGainsError(verdict.trouble, (verdict.broken,))
+        frugal = self._designer.least_power(
+            situation, cutoffs, self._demands, best.reference_a, self.goal.budget_kind
+        )
+        needed: float | None = None
+        if frugal is not None:
+            free = replace(self._limits, joule_mean_w=math.inf, electrical_mean_w=math.inf)
+            check = verify(situation, frugal, replace(self._demands, limits=free))
+            if not check.trouble:
+                needed = max(p.powers.of_kind(self.goal.budget_kind) for p in check.predictions)
+        return NoGainsError(verdict.trouble + self._remedy(needed), binding or (verdict.broken,), needed)
+
+    def _remedy(self, needed: float | None) -> str:
+        kind = self.goal.budget_kind.replace("_", " ")
+        if needed is None:
+            return "; no budget alone would do"
+        if needed <= self.goal.budget_w:
+            return ""
+        return f"; the least budget that would do is {needed:.3g} W {kind}"
 
 
-def predict(model: RigModel, gains: Gains, frequency_hz: float, amplitude: float) -> Prediction:
-    """Steady state under a set of gains, from the sampled model with delay and filters.
-
-    Parameters
-    ----------
-    amplitude
-        Peak of the excitation, in the exciting actuator's unit.
-    """
-    response = model.response(frequency_hz)[0]
-    law = complex(
-        model.paths(frequency_hz, gains.low_pass_hz, gains.high_pass_hz)[0]
-        @ np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
+def _question(
+    plant: Plant, damping_std: float, frequency: float, amplitude: float, gains: Gains
+) -> _Question:
+    absorber = plant.absorber
+    return _Question(
+        frequency_hz=frequency,
+        damping_ns_m=absorber.damping_at(frequency) if absorber is not None else 0.0,
+        damping_std_ns_m=damping_std,
+        amplitude=amplitude,
+        cutoffs_hz=(gains.low_pass_hz, gains.high_pass_hz),
     )
-    reference = law * response[2, 1] * amplitude / (1.0 - law * response[2, 0])
-    displacement, stroke, _, current = response @ np.array([reference, amplitude])
-    coil = model.coil
-    # Terminal voltage behind the current loop; its product with the current is what the amplifier delivers.
-    voltage = (coil.current_loop_kp_v_a or 0.0) * (reference - current)
-    return Prediction(
-        displacement_m=float(abs(displacement)),
-        stroke_m=float(abs(stroke)),
-        current_peak_a=float(abs(current)),
-        powers=Powers(
-            joule_mean_w=float(0.5 * coil.resistance_ohm * abs(current) ** 2),
-            joule_peak_w=float(coil.resistance_ohm * abs(current) ** 2),
-            electrical_mean_w=float(0.5 * (voltage * np.conj(current)).real),
-        ),
-    )
+
+
+def _check(plant: Plant, goal: TuningGoal) -> None:
+    coil, absorber = plant.voice_coil, plant.absorber
+    if coil is None or absorber is None:
+        raise InputError(
+            f"plant '{plant.name}' has no voice coil on an absorber: there is nothing to retune; give it an "
+            '[[actuator]] with kind = "voice_coil" between two bodies'
+        )
+    if coil.current_loop_kp_v_a is None:
+        raise InputError(
+            f"plant '{plant.name}': actuator '{coil.name}' needs current_loop_kp_v_a [V/A]: the rig's law commands a "
+            "current; add it to the plant file"
+        )
+    if len(plant.actuator) < 2:
+        raise InputError(
+            f"plant '{plant.name}' has no actuator that excites it; add an [[actuator]] such as kind = \"force\""
+        )
+    for key in (f"{coil.name}_current_a", "stroke_m"):
+        if key not in plant.limits:
+            raise InputError(
+                f"plant '{plant.name}': limits.{key} [{plant.limit_units[key]}] is missing; without it no gains "
+                "are proposed; add it to the plant file"
+            )
+    for name, value, unit in (
+        ("budget_w", goal.budget_w, "W"),
+        ("displacement_m", 1.0 if goal.displacement_m is None else goal.displacement_m, "m"),
+    ):
+        if not 0.0 < value < math.inf:
+            raise InputError(f"{name} must be greater than 0 {unit}, got {value}")
+    if not 0.0 <= goal.modulus_margin < 1.0:
+        raise InputError(f"modulus_margin must be from 0 to below 1, got {goal.modulus_margin}")
+    for name, value in (
+        ("slowest_decay_1_s", goal.slowest_decay_1_s),
+        ("delay_margin_s", goal.delay_margin_s),
+        ("drift_hz", goal.drift_hz),
+    ):
+        if not 0.0 <= value < math.inf:
+            raise InputError(f"{name} must not be below 0, got {value}")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from tuning.changes import Changes
-from tuning.limit import LimitProblem, LimitResult
+from tuning.limit import LimitResult
 from tuning.loop import LoopFacts, RigModel, margin_grid, margins
 from tuning.retune import Retuner, TuningGoal, predict
 from tuning.types import ActiveLimit, OperatingPoint, Powers
@@ -124,7 +124,6 @@ class WhatIf:
             raise InputError(f"the excitation's peak must be greater than 0, got {amplitude}")
         self.plant, self.facts, self.schedule, self.goal = plant, facts, schedule, goal
         self.amplitude, self.damping_std_ns_m = amplitude, damping_std_ns_m
-        self._limit = LimitProblem()
         self._tuners: dict[tuple[str, TuningGoal], Retuner] = {}
         self._models: dict[tuple[str, float], RigModel] = {}
         self._tuner(plant, goal)
@@ -231,7 +230,7 @@ class WhatIf:
         if key not in self._tuners:
             if len(self._tuners) >= KEPT_TUNERS:
                 self._tuners.pop(next(iter(self._tuners)))
-            self._tuners[key] = Retuner(plant, self.facts, goal, self._limit)
+            self._tuners[key] = Retuner(plant, self.facts, goal)
         return self._tuners[key]
 
     def _model(self, plant: Plant, fingerprint: str, f: float) -> RigModel:

@@ -1,0 +1,128 @@
+"""Steps of the gain search: a quadratic program of three variables with thousands of rows, solved exactly.
+
+    minimise ½ s'Hs + g's   subject to   rows s <= upper
+
+Goldfarb and Idnani (1983): from the free minimum, take in the row that is broken most, move along what the rows already
+binding leave free, drop those whose multiplier would turn negative. At most three rows bind at a time, and the rows of
+neighbouring frequencies, which are nearly parallel, do it no harm.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.plant.compiled import kernel
+from twin.plant.linear import Array
+
+VARIABLES = 3
+MOST_CHANGES = 200
+BROKEN = 1e-10
+PARALLEL = 1e-14
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step (3,), and which rows bind with which multipliers."""
+
+    step: Array
+    rows: NDArray[np.int64]
+    multipliers: Array
+
+
+def solve_step(hessian: Array, gradient: Array, rows: Array, upper: Array) -> Step | None:
+    """Solve for a step; None if the rows leave no room.
+
+    Parameters
+    ----------
+    hessian, gradient
+        (3, 3) positive definite, (3,).
+    rows, upper
+        (n, 3), (n,).
+    """
+    root = np.linalg.cholesky(hessian)
+    into = np.ascontiguousarray(np.linalg.inv(root).T)  # s = into z
+    pull = into.T @ gradient
+    reach = max(float(np.linalg.norm(pull)), 1e-300)
+    leaning = rows @ into
+    size = np.maximum(np.sqrt(np.einsum("ij,ij->i", leaning, leaning)), 1e-12)
+    leaning /= size[:, None]
+    z = -pull / reach
+    binding, multipliers = np.zeros(VARIABLES, dtype=np.int64), np.zeros(VARIABLES)
+    count = project(leaning, upper / (size * reach), z, binding, multipliers)
+    if count < 0:
+        return None
+    chosen = binding[:count].copy()
+    return Step(into @ z * reach, chosen, multipliers[:count] * reach / size[chosen])
+
+
+@kernel
+def project(rows: Array, upper: Array, z: Array, binding: NDArray[np.int64], multipliers: Array) -> int:
+    """Move a point, in place, to the nearest one with ``rows z <= upper``.
+
+    Parameters
+    ----------
+    rows, upper
+        (n, 3) of unit length, (n,).
+    z
+        (3,) the point.
+    binding, multipliers
+        (3,) receive which rows bind and how hard.
+
+    Returns
+    -------
+    int
+        How many bind; -1 if there is no such point.
+    """
+    n, count = len(upper), 0
+    r, d, gram = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    for _ in range(MOST_CHANGES):
+        worst, new = BROKEN, -1
+        for i in range(n):
+            excess = rows[i, 0] * z[0] + rows[i, 1] * z[1] + rows[i, 2] * z[2] - upper[i]
+            if excess > worst:
+                worst, new = excess, i
+        if new < 0:
+            return count
+        weight = 0.0
+        while True:
+            # What is left of the new row's direction by those that bind, and its parts along them.
+            for j in range(count):
+                for k in range(count):
+                    gram[j, k] = 0.0
+                    for v in range(3):
+                        gram[j, k] += rows[binding[j], v] * rows[binding[k], v]
+                r[j] = 0.0
+                for v in range(3):
+                    r[j] += rows[binding[j], v] * rows[new, v]
+            if count > 0:
+                r[:count] = np.linalg.solve(gram[:count, :count].copy(), r[:count].copy())
+            free = 0.0
+            for v in range(3):
+                d[v] = rows[new, v]
+                for j in range(count):
+                    d[v] -= r[j] * rows[binding[j], v]
+                free += d[v] * d[v]
+            limit, drop = np.inf, -1
+            for j in range(count):
+                if r[j] > 0.0 and multipliers[j] < limit * r[j]:
+                    limit, drop = multipliers[j] / r[j], j
+            excess = rows[new, 0] * z[0] + rows[new, 1] * z[1] + rows[new, 2] * z[2] - upper[new]
+            whole = excess / free if free > PARALLEL and count < 3 else np.inf
+            if drop < 0 and whole == np.inf:
+                return -1
+            t = min(limit, whole)
+            for j in range(count):
+                multipliers[j] -= t * r[j]
+            weight += t
+            if whole < np.inf:
+                for v in range(3):
+                    z[v] -= t * d[v]
+            if t == whole:
+                binding[count], multipliers[count] = new, weight
+                count += 1
+                break
+            for j in range(drop, count - 1):
+                binding[j], multipliers[j] = binding[j + 1], multipliers[j + 1]
+            count -= 1
+    return -1

@@ -1,0 +1,237 @@
+"""From a situation and what is asked of it to gains: start, search, tighten where the check grid sees more."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tuning.gains import GainProgram
+from tuning.limit import Disc, discs, electrical_square
+from tuning.search import Condition, Found, GainSearch, Stability
+from tuning.start import starts
+from tuning.steady import Pair, SteadyPaths
+from tuning.types import ActiveLimit, BudgetKind
+from tuning.verify import DELAYS, Demands, Situation
+from twin.control.schedule import Gains
+from twin.plant.config import Plant
+from twin.plant.errors import RunError
+from twin.plant.linear import Array, ComplexArray
+
+INSIDE = 1e-5
+"""Limits and margins are designed for by this share better than asked, so that rounding keeps them."""
+
+LATE_MARGIN = 0.05
+"""Distance from -1 that is designed for with the further delay in the loop."""
+
+TIGHTENINGS = 5
+FAILED = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """Gains as searched, not verified; what binds the law beside the physical limits, and the price of it."""
+
+    gains: Gains
+    active: tuple[ActiveLimit, ...]
+    found: Found
+
+
+class Designer:
+    """Design gains of the rig's law for any situation of a plant.
+
+    Parameters
+    ----------
+    plant
+        Its absorber gives the gains' scale and bounds.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        absorber = plant.absorber
+        if absorber is None:
+            raise ValueError(f"plant '{plant.name}' has no absorber")
+        w2 = math.sqrt(absorber.stiffness_n_m / absorber.mass_kg)
+        self._scale = np.array([absorber.mass_kg, absorber.mass_kg * w2, absorber.stiffness_n_m])
+        # alpha > -m2, gamma > -k2, beta free (thesis 6.2.3), with room to these bounds and far above.
+        self._bounds = np.array([[-0.95, 3.0], [-1.0, 1.0], [-0.95, 5.0]]) * self._scale[:, None]
+        self._program = GainProgram(self._scale, self._bounds)
+
+    def design(
+        self, situation: Situation, cutoffs_hz: tuple[float, float], demands: Demands, wish_a: complex
+    ) -> Design:
+        """Gains with the least motion or, with a displacement asked for, the least power that reaches it.
+
+        Parameters
+        ----------
+        wish_a
+            Reference at the physical limit [A].
+        """
+        if demands.displacement_m is not None:
+            return self._search(
+                situation,
+                cutoffs_hz,
+                demands,
+                wish_a,
+                "electrical" if demands.limits.electrical_mean_w < math.inf else "joule_mean",
+            )
+        return self._search(situation, cutoffs_hz, demands, wish_a, None)
+
+    def least_power(
+        self,
+        situation: Situation,
+        cutoffs_hz: tuple[float, float],
+        demands: Demands,
+        wish_a: complex,
+        kind: BudgetKind,
+    ) -> Gains | None:
+        """Gains that keep everything but the power with the least of it; None if there are none."""
+        free = replace(demands.limits, joule_mean_w=math.inf, electrical_mean_w=math.inf)
+        design = self._search(situation, cutoffs_hz, replace(demands, limits=free), wish_a, kind)
+        return design.gains if design.found.violation < FAILED else None
+
+    def _search(
+        self,
+        situation: Situation,
+        cutoffs_hz: tuple[float, float],
+        demands: Demands,
+        wish_a: complex,
+        kind: BudgetKind | None,
+    ) -> Design:
+        conditions, unit = self._conditions(situation, cutoffs_hz, demands, kind)
+        terms = situation.design_terms(cutoffs_hz)
+        margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
+        first: list[Array] | None = None
+        for _ in range(TIGHTENINGS):
+            stability = self._stability(situation, cutoffs_hz, demands, terms, margin, late)
+            search = GainSearch(self._scale, self._bounds, conditions, stability, unit)
+            if first is None:
+                first = self._starts(conditions[0], wish_a, terms[0], margin)
+            found = self._best(search, first)
+            alpha, beta, gamma = (float(x) for x in found.numbers)
+            gains = Gains(alpha, beta, gamma, *cutoffs_hz)
+            if found.violation > FAILED:
+                break
+            seen = situation.margins(gains)
+            short = demands.modulus_margin * (1.0 + INSIDE) - seen.modulus
+            hasty = seen.delay_s is not None and seen.delay_s < demands.delay_margin_s
+            if short <= 0.0 and not hasty:
+                break
+            margin += 1.5 * max(short, 0.0) + (1e-5 if short > 0.0 else 0.0)
+            late += LATE_MARGIN if hasty else 0.0
+            first = [found.numbers]
+        return Design(
+            gains, _prices(found, conditions[0], gains, situation.paths, demands, unit, kind), found
+        )
+
+    def _conditions(
+        self, situation: Situation, cutoffs_hz: tuple[float, float], demands: Demands, kind: BudgetKind | None
+    ) -> tuple[list[Condition], float]:
+        out = []
+        for k, (model, paths) in enumerate(situation.cases):
+            law = model.paths(paths.frequency_hz, *cutoffs_hz)[0]
+            bounds = [_tighter(d) for d in discs(paths, demands.limits)]
+            if k == 0 and demands.displacement_m is not None:
+                bounds.append(_tighter(Disc("displacement", *paths.motion, demands.displacement_m)))
+            weight = 1.0 if k == 0 else 0.0
+            out.append(Condition(law, paths.acceleration, _target(paths, kind), weight, tuple(bounds)))
+        if kind is None:
+            return out, abs(situation.paths.motion[1])
+        return out, max(
+            demands.limits.current_peak_a * abs(out[0].target[0] / situation.paths.current[0]), 1e-30
+        )
+
+    def _stability(
+        self,
+        situation: Situation,
+        cutoffs_hz: tuple[float, float],
+        demands: Demands,
+        terms: list[ComplexArray],
+        margin: float,
+        late: float,
+    ) -> Stability:
+        curves, least = list(terms), [margin] * len(terms)
+        if demands.delay_margin_s > 0.0:
+            for share in DELAYS:
+                turn = np.exp(-2j * np.pi * situation.design_grid * demands.delay_margin_s * share)
+                curves.append(terms[0] * turn[:, None])
+                least.append(min(late, 0.5 + 0.5 * margin))
+        n = len(situation.design_grid)
+        first = np.zeros(n * len(curves), dtype=np.bool_)
+        first[::n] = True
+        # Less damping is what makes a loop slow: of the models the one with the least of it.
+        slow = situation.models[1 if len(situation.models) > 1 else 0]
+        decaying = (slow,) if demands.slowest_decay_1_s > 0.0 else ()
+        wanted = demands.slowest_decay_1_s * (1.0 + 1e-4)
+        return Stability(np.vstack(curves), np.repeat(least, n), first, decaying, wanted, cutoffs_hz)
+
+    def _starts(
+        self, condition: Condition, wish_a: complex, terms: ComplexArray, margin: float
+    ) -> list[Array]:
+        found = starts(condition, wish_a, terms, margin, self._scale, self._bounds)
+        best = found[0]
+        if float(np.min(np.abs(1.0 + terms @ best))) < margin:
+            per_ampere, alone = condition.acceleration
+            acceleration = per_ampere * wish_a + alone
+            try:
+                projected = self._program.solve(condition.law * acceleration, wish_a, terms, margin, best)
+                found = [projected, *found]
+            except RunError:
+                pass  # The search itself will say what is in the way.
+        return found
+
+    @staticmethod
+    def _best(search: GainSearch, first: list[Array]) -> Found:
+        best: Found | None = None
+        for start in first:
+            found = search.run(start)
+            if best is None or (found.violation > FAILED, found.objective) < (
+                best.violation > FAILED,
+                best.objective,
+            ):
+                best = found
+            if best.violation <= FAILED:
+                break
+        if best is None:
+            raise ValueError("no start was given")
+        return best
+
+
+def _target(paths: SteadyPaths, kind: BudgetKind | None) -> Pair:
+    """What is to be small: motion, current, or the root of the electrical power above its least."""
+    if kind is None:
+        return paths.motion
+    if kind == "electrical":
+        slope, offset, _ = electrical_square(paths)
+        return slope, offset
+    return paths.current
+
+
+def _tighter(disc: Disc) -> Disc:
+    return replace(disc, bound=disc.bound * (1.0 - INSIDE))
+
+
+def _prices(
+    found: Found,
+    condition: Condition,
+    gains: Gains,
+    paths: SteadyPaths,
+    demands: Demands,
+    unit: float,
+    kind: BudgetKind | None,
+) -> tuple[ActiveLimit, ...]:
+    """What binds the law beside the physical limits, at what it costs in motion."""
+    if kind is not None:
+        return ()
+    law = complex(condition.law @ found.numbers)
+    per_ampere, alone = condition.acceleration
+    reference = law * alone / (1.0 - law * per_ampere)
+    size = abs(paths.motion[0] * reference + paths.motion[1])
+    if size < 1e-3 * unit:
+        return ()  # Nothing is left to pay for.
+    per_cost = unit**2 / (2.0 * size)
+    out = []
+    for name, weight in found.binding.items():
+        if name == "modulus margin":
+            out.append(ActiveLimit(name, weight * per_cost))
+        elif name == "decay":
+            out.append(ActiveLimit(name, weight * per_cost / demands.slowest_decay_1_s))
+    return tuple(a for a in out if a.price > 1e-6 * unit)

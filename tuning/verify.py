@@ -1,0 +1,194 @@
+"""Everything a proposal states, recomputed from the deployed numbers alone on the full sampled model.
+
+No solver's word is taken: poles, modulus and delay margin, motion, stroke, current, voltage and powers, at the
+excitation and beside it, at the damping and two standard deviations off.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tuning.limit import CoilLimits
+from tuning.loop import LoopFacts, Margins, RigModel, margins, mode_grid
+from tuning.steady import Prediction, SteadyPaths, paths_from, reference_under
+from twin.control.chain import chain_response
+from twin.control.schedule import Gains
+from twin.plant.config import Plant
+from twin.plant.linear import Array, ComplexArray
+
+ROUNDING = 1e-9
+CHECK_POINTS = 150
+DESIGN_POINTS = 36
+DELAYS = (0.5, 1.0)
+
+
+class Situation:
+    """One operating point: the models it may turn out to be, and the frequencies it may drift to.
+
+    Parameters
+    ----------
+    plant
+        As identified.
+    frequency_hz, amplitude
+        Of the excitation; peak, in the exciting actuator's unit.
+    damping_std_ns_m
+        Standard deviation of the absorber's damping [Ns/m]; the models have it two of them off.
+    drift_hz
+        How far the excitation may be off.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        facts: LoopFacts,
+        frequency_hz: float,
+        amplitude: float,
+        damping_std_ns_m: float,
+        drift_hz: float,
+    ) -> None:
+        absorber = plant.absorber
+        damping = absorber.damping_at(frequency_hz) if absorber is not None else 0.0
+        off = 2.0 * damping_std_ns_m
+        dampings = [damping] if off == 0.0 else [damping, max(0.0, damping - off), damping + off]
+        self.facts, self.frequency_hz, self.amplitude = facts, frequency_hz, amplitude
+        self.damping_std_ns_m = damping_std_ns_m
+        self.models = [RigModel(plant, facts, frequency_hz, c) for c in dampings]
+        nominal = self.models[0]
+        beside = [frequency_hz - drift_hz, frequency_hz + drift_hz] if drift_hz > 0.0 else []
+        f = np.array([frequency_hz, *beside])
+        self.cases: list[tuple[RigModel, SteadyPaths]] = [
+            (nominal, paths_from(nominal, float(x), r, amplitude))
+            for x, r in zip(f, nominal.response(f), strict=True)
+        ]
+        for model in self.models[1:]:
+            response = model.response(frequency_hz)[0]
+            self.cases.append((model, paths_from(model, frequency_hz, response, amplitude)))
+
+    @property
+    def paths(self) -> SteadyPaths:
+        """Of the nominal model at the excitation."""
+        return self.cases[0][1]
+
+    @cached_property
+    def design_grid(self) -> Array:
+        """Frequencies the search looks at [Hz]."""
+        return mode_grid(self.models[0], DESIGN_POINTS)
+
+    @cached_property
+    def _design_accelerations(self) -> list[ComplexArray]:
+        return [m.acceleration(self.design_grid) for m in self.models]
+
+    @cached_property
+    def _check_grid(self) -> Array:
+        return mode_grid(self.models[0], CHECK_POINTS)
+
+    @cached_property
+    def _check_accelerations(self) -> list[ComplexArray]:
+        return [m.acceleration(self._check_grid) for m in self.models]
+
+    def design_terms(self, cutoffs_hz: tuple[float, float]) -> list[ComplexArray]:
+        """Loop gain per unit of each gain on the design grid, one (n, 3) per model."""
+        chain = self._chain(self.design_grid, cutoffs_hz)
+        return [-a[:, None] * chain for a in self._design_accelerations]
+
+    def _chain(self, grid: Array, cutoffs_hz: tuple[float, float]) -> ComplexArray:
+        model = self.models[0]
+        delay = np.exp(-2j * np.pi * grid * self.facts.delay_samples / self.facts.sample_rate_hz)
+        chain = chain_response(grid, *cutoffs_hz, self.facts.sample_rate_hz)
+        return np.asarray(chain * (delay / model.coil.force_constant_n_a)[:, None])
+
+    def predictions(self, gains: Gains) -> list[Prediction]:
+        """Steady state of every case, the nominal one at the excitation first."""
+        return [paths.at(reference_under(model, gains, paths)) for model, paths in self.cases]
+
+    def margins(self, gains: Gains) -> Margins:
+        """The least margins of all models."""
+        chain = self._chain(self._check_grid, (gains.low_pass_hz, gains.high_pass_hz))
+        found = [margins(-a[:, None] * chain, self._check_grid, gains) for a in self._check_accelerations]
+        delay = min((m.delay_s for m in found if m.delay_s is not None), default=None)
+        return Margins(min(m.modulus for m in found), delay)
+
+    def decay_rate_1_s(self, gains: Gains) -> float:
+        """Slowest decay of all models [1/s]; below 0 is stable."""
+        return max(m.decay_rate_1_s(gains) for m in self.models)
+
+
+@dataclass(frozen=True, slots=True)
+class Demands:
+    """What gains must keep."""
+
+    limits: CoilLimits
+    modulus_margin: float
+    delay_margin_s: float
+    slowest_decay_1_s: float
+    displacement_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What was found of a set of gains; ``trouble`` says what is wrong, empty if nothing is.
+
+    Attributes
+    ----------
+    broken
+        Name of what is broken first.
+    margins, decay_rate_1_s
+        The worst of all models; margins of an unstable loop are none.
+    predictions
+        Of every case of the `Situation`.
+    """
+
+    trouble: str
+    broken: str
+    margins: Margins
+    decay_rate_1_s: float
+    predictions: tuple[Prediction, ...]
+
+
+def verify(situation: Situation, gains: Gains, demands: Demands) -> Verdict:
+    """Check a set of gains against everything that is asked."""
+    decay = situation.decay_rate_1_s(gains)
+    none = Margins(0.0, 0.0)
+    if not decay < -demands.slowest_decay_1_s * (1.0 - ROUNDING):
+        wanted = f"wanted below -{demands.slowest_decay_1_s:g} 1/s"
+        return Verdict(f"slowest pole at {decay:+.2f} 1/s, {wanted}", "decay", none, decay, ())
+    found = situation.margins(gains)
+    predictions = tuple(situation.predictions(gains))
+    trouble, broken = _broken(situation, predictions, found, demands)
+    return Verdict(trouble, broken, found, decay, predictions)
+
+
+def _broken(
+    situation: Situation, predictions: tuple[Prediction, ...], found: Margins, demands: Demands
+) -> tuple[str, str]:
+    if found.modulus < demands.modulus_margin * (1.0 - ROUNDING):
+        return f"modulus margin {found.modulus:.3f}, wanted {demands.modulus_margin:g}", "modulus margin"
+    if found.delay_s is not None and found.delay_s < demands.delay_margin_s:
+        wanted = f"wanted {1e6 * demands.delay_margin_s:.0f} µs"
+        return f"delay margin {1e6 * found.delay_s:.0f} µs, {wanted}", "delay margin"
+    limits = demands.limits
+    for (_, paths), p in zip(situation.cases, predictions, strict=True):
+        values = (
+            ("power", "W mean Joule", p.powers.joule_mean_w, limits.joule_mean_w),
+            ("electrical", "W mean electrical power", p.powers.electrical_mean_w, limits.electrical_mean_w),
+            ("current", "A", p.current_peak_a, limits.current_peak_a),
+            ("stroke", "m", p.stroke_m, limits.stroke_m),
+            ("voltage", "V", p.voltage_peak_v, limits.voltage_peak_v),
+        )
+        for name, unit, value, limit in values:
+            if not value <= limit * (1.0 + ROUNDING):
+                return (
+                    f"{name} {value:.4g} {unit} at {paths.frequency_hz:.2f} Hz is over the limit {limit:.4g}",
+                    name,
+                )
+    wanted_m = demands.displacement_m
+    if wanted_m is not None and not predictions[0].displacement_m <= wanted_m * (1.0 + 1e-6):
+        return (
+            f"displacement {1e6 * predictions[0].displacement_m:.4g} µm, wanted {1e6 * wanted_m:.4g} µm",
+            "displacement",
+        )
+    if not all(math.isfinite(p.displacement_m) for p in predictions):
+        return "the motion has no bound", "displacement"
+    return "", ""
