@@ -121,6 +121,7 @@ class SignalCheck:
         self._run_length = np.zeros(n, dtype=np.int64)
         self._tail = np.full((4, n), math.nan)
         self._moving = np.zeros(n, dtype=np.bool_)
+        self._spacing: dict[int, tuple[int, int]] = {}
 
     def advance(self, block: Block) -> CheckedBlock:
         """Check one block.
@@ -158,12 +159,15 @@ class SignalCheck:
                         kinds[:, c],
                     )
                 if jumps[c] and math.isfinite(bound[c]):
-                    mark_spikes(values[:, c], self._tail[:, c], bound[c], kinds[:, c])
+                    # One sample in the next code of a coarse converter is no spike.
+                    code = self._code(int(c)) * self._std[c] or _least_step(values[:, c])
+                    least = max(bound[c], 2.5 * code)
+                    mark_spikes(values[:, c], came[:, c], self._tail[:, c], least, kinds[:, c])
             if kinds.any():
                 valid = came & (kinds == 0)
                 valid.flags.writeable = False
                 findings = self._findings(block, kinds)
-        self._remember(values, same, rough, low, high)
+        self._remember(np.where(came[-4:], values[-4:], math.nan), values, same, rough, low, high)
         if not came.all():
             # What stands in the place of a missing sample is no reading: it starts no run.
             self._run_length[~came.all(axis=0)] = 1
@@ -181,7 +185,7 @@ class SignalCheck:
         scan(values, self._tail[2:], self._range, self._std, self._std, self._noisy, self._steps.copy())
         mark_missing(values, np.array(block.valid), self._range, kinds)
         mark_runs(values[:, 0], 10, self._run_length[0], self._tail[3, 0], kinds[:, 0])
-        mark_spikes(values[:, 0], self._tail[:, 0], 1.0, kinds[:, 0])
+        mark_spikes(values[:, 0], np.array(block.valid)[:, 0], self._tail[:, 0], 1.0, kinds[:, 0])
         trailing_runs(values, self._run_length, np.zeros(values.shape[1], dtype=np.int64))
 
     def _know_roughness(self, values: Array, came: NDArray[np.bool_]) -> None:
@@ -194,16 +198,21 @@ class SignalCheck:
                 # The median of |normal| is 0.845 of its mean.
                 self._roughness[c] = float(np.median(second)) / 0.845
 
-    def _longest_run(self, column: int) -> int:
-        """Number of equal samples from which on a channel is stuck."""
+    def _code(self, column: int) -> float:
+        """Step of a channel's converter, at most, in standard deviations; 0 while it is not known."""
         steps = self._steps[column]
         total = steps.sum()
         if total < LEAST_STEPS:
+            return 0.0
+        return float(2.0 ** (int(np.argmax(np.cumsum(steps) >= max(5.0, 0.02 * total))) + LOWEST))
+
+    def _longest_run(self, column: int) -> int:
+        """Number of equal samples from which on a channel is stuck."""
+        code = self._code(column)
+        if code == 0.0:
             others = self._moving.copy()
             others[column] = False
             return self._longest_start if others.any() else _NEVER
-        first = int(np.argmax(np.cumsum(steps) >= 0.01 * total))
-        code = 2.0 ** (first + LOWEST)  # step of the converter, at most, in standard deviations
         # Resting in the middle of a code, every sample falls into it with this probability.
         stay = math.erf(code * NOISE_MARGIN / (2.0 * math.sqrt(2.0)))
         if stay >= 1.0:
@@ -218,6 +227,8 @@ class SignalCheck:
             for code, kind in _KINDS.items():
                 rows = kinds[:, c] == code
                 samples = int(rows.sum())
+                if kind == "missing":
+                    samples = self._unexpectedly_missing(c, rows, block.first_sample)
                 if not samples:
                     continue
                 there = block.values[rows, c]
@@ -229,6 +240,23 @@ class SignalCheck:
                 )
         return findings
 
+    def _unexpectedly_missing(self, column: int, missing: NDArray[np.bool_], first_sample: int) -> int:
+        """How many samples are missing of a channel that may be sampled more slowly than the block.
+
+        Such a channel has a sample at every so many rows; the spacing is taken from the data once it is even.
+        """
+        there = np.flatnonzero(~missing) + first_sample
+        apart = np.diff(there)
+        if (apart == 1).any():
+            self._spacing.pop(column, None)
+        elif len(apart) and (apart == apart[0]).all():
+            self._spacing[column] = (int(apart[0]), int(there[0]) % int(apart[0]))
+        spacing, phase = self._spacing.get(column, (1, 0))
+        if spacing == 1:
+            return int(missing.sum())
+        due = (np.arange(len(missing)) + first_sample) % spacing == phase
+        return int((missing & due).sum())
+
     def _is_flat_top(self, value: float, signal: Array, column: int) -> bool:
         """Whether a repeated value is the end of a range the channel moved through in the same block."""
         low, high = float(np.nanmin(signal)), float(np.nanmax(signal))
@@ -236,11 +264,25 @@ class SignalCheck:
         return wide and value in {low, high} and value != 0.0
 
     def _remember(
-        self, values: Array, same: NDArray[np.int64], rough: Array, low: Array, high: Array
+        self,
+        tail: Array,
+        values: Array,
+        same: NDArray[np.int64],
+        rough: Array,
+        low: Array,
+        high: Array,
     ) -> None:
         n = len(values)
         sound = np.isfinite(rough) & np.isfinite(self._roughness) & (same < 0.5 * n)
         self._roughness[sound] += _FADE * (rough[sound] - self._roughness[sound])
         self._moving = self._noisy & (high - low > MOVING_SIGMAS * self._std)
-        self._tail = np.vstack([self._tail, values[-4:]])[-4:]
+        self._tail = np.vstack([self._tail, tail])[-4:]
         self._run_length = trailing_runs(values, self._run_length, same)
+
+
+def _least_step(signal: Array) -> float:
+    """Smallest difference between neighbours that are not equal; 0 if all are."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        steps = np.abs(np.diff(signal))
+    steps = steps[(steps > 0.0) & np.isfinite(steps)]
+    return float(steps.min()) if len(steps) else 0.0

@@ -162,16 +162,20 @@ def insert(sorted_: Array, count: int, value: float) -> None:
 
 
 @kernel
-def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint8]) -> None:
+def mark_spikes(
+    signal: Array, valid: NDArray[np.bool_], tail: Array, bound: float, kinds: NDArray[np.uint8]
+) -> None:
     """Mark by 4 what lies off the median of five by more than the bound, and by more than three of them spread.
 
     Steps and one or two spikes among five leave the median where it is; the five are freed of their slope first. The
     spread of those three that lie closest together keeps the crests of an oscillation sampled a few times per period
-    from passing for spikes (Hampel's filter with a guard). The block's last two samples are judged with those before
-    them.
+    from passing for spikes (Hampel's filter with a guard). The block's last two samples are judged, less
+    strictly, with those before them.
 
     Parameters
     ----------
+    valid
+        (n,) whether a sample is one.
     tail
         (4,) samples before the block; NaN where there are none.
     """
@@ -188,8 +192,10 @@ def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint
                 complete = False
             elif at < 0:
                 window[j] = tail[4 + at]
-            else:
+            elif valid[at]:
                 window[j] = signal[at]
+            else:
+                complete = False
             if complete and not np.isfinite(window[j]):
                 complete = False
         if not complete:
@@ -203,5 +209,7 @@ def mark_spikes(signal: Array, tail: Array, bound: float, kinds: NDArray[np.uint
             insert(level, j, window[j] - slope * (j - 2))
         off = abs(signal[k] - slope * (k - start - 2) - level[2])
         spread = min(level[2] - level[0], level[3] - level[1], level[4] - level[2])
-        if off > bound and off > 3.0 * spread:
+        # At the block's end the five lie to one side, where a curve bends away from its slope further.
+        least = bound if start == k - 2 else 3.0 * bound
+        if off > least and off > 3.0 * spread:
             kinds[k] = 4

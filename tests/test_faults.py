@@ -106,10 +106,10 @@ def run(name: str) -> Run:
         raw, on, answers = rig.next_block()
         values = raw.astype(np.float64)
         if wrong and not isinstance(case.fault, WrongModel):
-            for name in case.on:
-                signal = values[:, columns[name]].copy()
+            for channel in case.on:
+                signal = values[:, columns[channel]].copy()
                 case.fault(signal, (k - ONSET) * BLOCK / RATE_HZ, k - ONSET, rng)
-                values[:, columns[name]] = signal
+                values[:, columns[channel]] = signal
         applied = tuple(a.command_id for a in answers)
         block = make_block(first, RATE_HZ, values, rig.channels, control_on=on, commands_applied=applied)
         frame = session.advance(block)
