@@ -20,6 +20,9 @@ SETTLED_BLOCKS = 3
 SETTLED_1_S = 0.5
 """Nor may the absorber's amplitude or phase move faster than this, or the primary's, |A'/A|."""
 
+SETTLED_SHARE = 0.05
+"""And no more than this share of the coil's power may be at other frequencies than the excitation's."""
+
 FLOOR_SIGMAS = 20.0
 """Motion below so many standard deviations of what is unknown is no test at five per cent."""
 

@@ -4,9 +4,9 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from twin.plant.files import load_plant
 from twin.plant.linear import Array
 from twin.rig.embedded import EmbeddedRig
 from twin.rig.programme import Programme, Sweep
+from twin.rig.tests_of_chapter_7 import programme as thesis_programme
 
 if TYPE_CHECKING:
     from tuning.loop import LoopFacts
@@ -50,6 +51,11 @@ class DemoOptions:
     window: bool = False
     web: bool = False
     speed: float | None = None
+    test: Literal[1, 3] = 3
+
+
+GROWTH_SEEN_1_S = 0.3
+"""In Test 1 the twin holds its retuning back until the coil's current grows so fast by itself."""
 
 
 def true_damping(seed: int) -> DampingTable:
@@ -131,7 +137,10 @@ def run_demo(
     dict
         Figures by name (see the command's help); ``error`` is there if the rig failed.
     """
-    programme = demo_programme(options.seconds, options.seed)
+    if options.test == 1:
+        programme = thesis_programme("test1", seconds=options.seconds, seed=options.seed)
+    else:
+        programme = demo_programme(options.seconds, options.seed)
     speed = options.speed if options.speed is not None else (1.0 if options.window or options.web else 0.0)
     with EmbeddedRig(programme, speed) as rig:
         # The rig starts up on another core while this process loads its solvers and viewer: seconds saved.
@@ -143,6 +152,10 @@ def run_demo(
 
         log, in_loop_s, error = RunLog(), 0.0, ""
         goal, retuning = TuningGoal(budget_w=options.budget_w), RetuningSettings()
+        if options.test == 1:
+            # One retune for the whole table, and only once the rig shows what the gains do.
+            goal = replace(goal, reach_hz=SWEEP_HZ[1] - SWEEP_HZ[0])
+            retuning = replace(retuning, only_if_unstable=True, only_if_growing_1_s=GROWTH_SEEN_1_S)
         # Where the rig does not wait for the twin, the twin does not wait for its tuner either.
         lag = None if speed else retuning.lag_blocks
         tuner = TunerProcess(programme.plant, facts_of(programme), goal, lag)
@@ -237,12 +250,14 @@ def describe_run(programme: Programme, options: DemoOptions) -> str:
     s = programme.schedule
     return "\n".join(
         [
-            "# Thesis Test 3, simulated rig",
+            f"# Thesis Test {options.test}, simulated rig",
             "",
             f"- excitation: {sweep.amplitude:g} {sweep.unit} on the {programme.exciter.name}, {sweep.description}",
             f"- control on between {s.on_from_hz:g} and {s.on_to_hz:g} Hz",
             f"- loop delay {programme.loop_delay_samples} sample + hold at {programme.sample_rate_hz / 1e3:g} kS/s",
             f"- budget {options.budget_w:g} W mean Joule power (R i_rms²)",
-            f"- seed {options.seed}: sensor noise and the true coil damping, which the twin has to learn",
+            f"- seed {options.seed}: sensor noise and the true coil damping, which the twin has to learn"
+            if options.test == 3
+            else "- gains of the test's own, unstable from 52 Hz; retuned once, when the rig shows it",
         ]
     )

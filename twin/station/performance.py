@@ -25,11 +25,15 @@ class PerformanceMeter:
 
     def __init__(self, plant: Plant, channels: tuple[str, ...]) -> None:
         self._coil = plant.voice_coil
-        self._column, self._order, self._absorber = -1, 0, -1
+        self._column, self._order, self._absorber, self._current = -1, 0, -1, -1
         absorber = plant.absorber
         for sensor in plant.sensor:
+            if sensor.name not in channels:
+                continue
             if absorber is not None and sensor.kind == "acceleration" and sensor.of == absorber.name:
-                self._absorber = channels.index(sensor.name) if sensor.name in channels else -1
+                self._absorber = channels.index(sensor.name)
+            if self._coil is not None and sensor.kind == "current" and sensor.of == self._coil.name:
+                self._current = channels.index(sensor.name)
         for sensor in plant.sensor:
             order = {"displacement": 0, "velocity": 1, "acceleration": 2}.get(sensor.kind)
             if order is not None and sensor.of == plant.primary.name and sensor.name in channels:
@@ -90,6 +94,17 @@ class PerformanceMeter:
         if self._absorber < 0 or phasors.amplitude[self._absorber] == 0.0:
             return math.inf
         return float(abs(phasors.slope[self._absorber] / phasors.amplitude[self._absorber]))
+
+    def elsewhere(self, phasors: Phasors, performance: Performance) -> float:
+        """Share of the mean Joule power that the coil's current at the excitation does not account for.
+
+        What still rings after a step has its own frequency; NaN if no sensor measures the current.
+        """
+        power = performance.powers.joule_mean_w
+        if self._coil is None or self._current < 0 or not power > 0.0:
+            return math.nan
+        at_excitation = 0.5 * self._coil.resistance_ohm * abs(phasors.amplitude[self._current]) ** 2
+        return float(abs(1.0 - at_excitation / power))
 
 
 def _current_of(coil: VoiceCoil, estimate: StateEstimate) -> Array | None:

@@ -4,7 +4,10 @@ Questions go to a `Tuner`; here is only compared and counted. What is decided de
 blocks at which answers came, all of which are recorded, so that a replay repeats it.
 """
 
+from collections import deque
 from dataclasses import dataclass
+
+import numpy as np
 
 from estimators.damping import DampingLearner
 from estimators.types import DampingCurve, Phasors
@@ -24,6 +27,9 @@ COMMAND_LEAD_BLOCKS = 2
 
 FORGOTTEN_BLOCKS = 20
 """A command that the rig has neither obeyed nor refused after this many blocks is no longer waited for."""
+
+GROWTH_BLOCKS = 10
+"""Growth is measured over so many blocks."""
 
 MAX_AHEAD_HZ = 3.0
 """A jump of the excitation is no sweep: no more of the table than this is retuned ahead of it."""
@@ -49,6 +55,8 @@ class RetuningSettings:
         How far one command may move any of the law's terms, as a share of the absorber's stiffness.
     only_if_unstable
         Keep the gains in use for as long as they are stable.
+    only_if_growing_1_s
+        And, with that, until the coil's current reference is seen to grow this fast; 0 does not wait for it.
     """
 
     every_blocks: int = 5
@@ -58,6 +66,7 @@ class RetuningSettings:
     reversal: float = 4.0
     longest_step: float = 0.1
     only_if_unstable: bool = False
+    only_if_growing_1_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +130,8 @@ class Retuning:
         self._open: Question | None = None
         self._last_step: dict[int, tuple[float, ...]] = {}
         self._unstable: Instability | None = None
+        self._reference_rms: deque[float] = deque(maxlen=GROWTH_BLOCKS)
+        self._block_s = 0.1
 
     def warm_up(self, plant: Plant) -> None:
         """Make the tuner ready; may take seconds."""
@@ -151,6 +162,7 @@ class Retuning:
         curve: DampingCurve | None,
         plant: Plant,
         learner: DampingLearner,
+        reference_rms: float = 0.0,
         doubt: str = "",
     ) -> Turn:
         """Take an answer if one has come, decide about it, and ask the next question if it is time.
@@ -163,10 +175,14 @@ class Retuning:
             How far the excitation moved over this block [Hz].
         plant
             The plant as identified.
+        reference_rms
+            Root mean square of the coil's current reference over the block [A]; 0 if it is not recorded.
         doubt
             Why the model must not be relied on at present; nothing is proposed then.
         """
         last = block.end_sample - 1
+        self._block_s = block.n_samples / block.sample_rate_hz
+        self._reference_rms.append(reference_rms)
         arrival = self.tuner.take(last)
         done = Turn() if arrival is None else self._decide(block, arrival, plant, doubt)
         self._since_question += 1
@@ -191,7 +207,18 @@ class Retuning:
         return Turn(asked, arrival, done.proposal, done.decision, done.command, done.events)
 
     def _is_wanted(self) -> bool:
-        return not self.settings.only_if_unstable or self._unstable is not None
+        settings = self.settings
+        if not settings.only_if_unstable:
+            return True
+        seen = settings.only_if_growing_1_s <= 0.0 or self._growth_1_s() >= settings.only_if_growing_1_s
+        return self._unstable is not None and seen
+
+    def _growth_1_s(self) -> float:
+        """Rate at which the coil's current reference grew over the last blocks [1/s]."""
+        rms = self._reference_rms
+        if len(rms) < GROWTH_BLOCKS or min(rms) <= 0.0:
+            return 0.0
+        return float(np.polyfit(np.arange(len(rms)) * self._block_s, np.log(rms), 1)[0])
 
     def _question(
         self,

@@ -27,7 +27,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.inputs import DriveReader, driven_model
 from twin.plant.parallel import ParallelPlant
-from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, AuditPoint, audit_point
+from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, SETTLED_SHARE, AuditPoint, audit_point
 from twin.station.frame import Event, Frame, Performance
 from twin.station.performance import PerformanceMeter
 from twin.station.retuning import Retuning, RetuningSettings, Turn
@@ -354,6 +354,10 @@ class Session:
         amplitude = 0.0
         if phasors is not None:
             amplitude = abs(phasors.amplitude[self._names.index(phasors.reference)])
+        coil = self.plant.voice_coil
+        rms = 0.0
+        if coil is not None and coil.name in self._names:
+            rms = float(np.sqrt(np.mean(np.square(block.values[:, self._names.index(coil.name)]))))
         return self.retuning.turn(
             block,
             phasors,
@@ -362,6 +366,7 @@ class Session:
             curve,
             self.identified_plant(),
             self._learner,
+            reference_rms=rms if math.isfinite(rms) else 0.0,
             doubt=health.reason if health.verdict == "diverged" else "",
         )
 
@@ -392,6 +397,7 @@ class Session:
             and self._since_switch >= SETTLED_BLOCKS
             and retuning.same_for_blocks >= SETTLED_BLOCKS
             and self._meter.absorber_drift_1_s(phasors) < SETTLED_1_S
+            and not self._meter.elsewhere(phasors, performance) > SETTLED_SHARE
         )
         if settled:
             noise, rate = self._meter.displacement_std(phasors), self._meter.displacement_rate(phasors)

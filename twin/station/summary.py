@@ -11,6 +11,7 @@ from twin.plant.config import DampingTable
 from twin.plant.linear import Array
 from twin.station.audit import Audit
 from twin.station.frame import Frame
+from twin.station.instability import InstabilityLog
 
 BAND_HZ = (45.0, 55.0)
 SETTLED_S = 0.5
@@ -39,6 +40,7 @@ class RunLog:
     questions: int = 0
     outdated: int = 0
     audit: Audit = field(default_factory=Audit)
+    instability: InstabilityLog = field(default_factory=InstabilityLog)
     _on_for_s: float = 0.0
 
     def add(self, frame: Frame) -> None:
@@ -51,6 +53,7 @@ class RunLog:
         self.commands += frame.command is not None
         if frame.decision is not None and frame.decision.reason.startswith("outdated"):
             self.outdated += 1
+        self.instability.add(frame)
         self.questions += frame.asked is not None
         if frame.audited is not None:
             self.audit.points.append(frame.audited)
@@ -106,6 +109,7 @@ class RunLog:
             "commands": self.commands,
             "outdated_proposals": self.outdated if self.questions else None,
             "audit": self.audit.summary() if self.audit.points else None,
+            "instability": self.instability.figures(),
         }
 
 
