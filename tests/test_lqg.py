@@ -178,6 +178,18 @@ def test_budget_holds_beside_the_frequency_and_the_loop_at_other_dampings() -> N
         assert other.margins(53.0).modulus >= 0.49
 
 
+def test_voltage_limit_is_kept_by_spending_less_where_less_current_is_less_voltage() -> None:
+    free = designed("engine_vcm", 47.0, 25.0)
+    most = 0.95 * free.steady.voltage_peak_v
+    designer = LQGDesigner(PLANTS["engine_vcm"], loop_facts(RATE_HZ, 50e-6))
+    held = designer.solve(47.0, 1000.0, joule_mean_w=25.0, voltage_peak_v=most)
+    assert held.steady.voltage_peak_v <= most
+    assert held.steady.powers.joule_mean_w < free.steady.powers.joule_mean_w
+    # At 53 Hz the current holds the stroke down, and with it the back-EMF: less current is more voltage.
+    with pytest.raises(RunError, match="kept the limit voltage_peak_v"):
+        designer.solve(53.0, 1000.0, joule_mean_w=25.0, voltage_peak_v=1.0)
+
+
 def test_noise_of_the_sensors_burns_little_and_goes_with_the_square_of_their_density() -> None:
     design = designed("rig", 46.0, 0.4)
     loop = loop_of("rig", design)

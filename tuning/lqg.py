@@ -109,6 +109,7 @@ class LQGDesigner:
         current_peak_a: float = math.inf,
         electrical_mean_w: float = math.inf,
         stroke_m: float = math.inf,
+        voltage_peak_v: float = math.inf,
         drift_hz: float = 0.0,
         damping_std_ns_m: float = 0.0,
     ) -> LQGDesign:
@@ -119,6 +120,8 @@ class LQGDesigner:
         frequency_hz, excitation_amplitude, damping_ns_m, joule_mean_w, current_peak_a, electrical_mean_w, stroke_m, \
 drift_hz
             As `PowerBudgetedLQ.solve`; here the limits hold for the deployed law with the observer's error in it.
+        voltage_peak_v
+            Limit on the coil's terminal voltage [V]; kept by spending less power where it binds.
         damping_std_ns_m
             Margins and stability hold two of these off the damping, too.
 
@@ -144,6 +147,7 @@ drift_hz
             "electrical_mean_w": electrical_mean_w, "stroke_m": stroke_m,
         }  # fmt: skip
         bounds, start = dict(asked), 0
+        asked["voltage_peak_v"] = voltage_peak_v
         best: LQGDesign | None = None
         shares: dict[str, float] = {}
         for _ in range(TRIES):
@@ -159,6 +163,10 @@ drift_hz
             if not off:
                 break
             # What the observer's error spends more or less than the design is made good in the design's bounds.
+            if "voltage_peak_v" in off:
+                spent = min(bounds["joule_mean_w"], lq.joule_mean_w)
+                bounds["joule_mean_w"] = spent * (0.99 / shares["voltage_peak_v"]) ** 2
+                continue
             bounds = {
                 name: bound * (0.5 + 0.5 * USED) / shares[name] if name in off else bound
                 for name, bound in bounds.items()
@@ -206,6 +214,7 @@ drift_hz
             "current_peak_a": max(s.current_peak_a for s in states),
             "electrical_mean_w": max(s.powers.electrical_mean_w for s in states),
             "stroke_m": max(s.stroke_m for s in states),
+            "voltage_peak_v": max(s.voltage_peak_v for s in states),
         }
         return {name: used[name] / bound for name, bound in asked.items()}
 
