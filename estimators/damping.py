@@ -1,95 +1,26 @@
-"""Coil damping against frequency, from the absorber's own force balance.
-
-    m2 a2 + k2 (x2 - x1) + c2 (v2 - v1) = f_act
-
-holds for the phasors of measured signals whatever the controller does with them, so that filter phase, which a
-damping found by turning gains until the table is quiet would contain, never enters. In phase it gives k2, in
-quadrature c2.
-"""
+"""Coil damping against frequency, learned block by block from the absorber's force balance."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 
-from estimators.kernels import scalar_update
-from estimators.types import DampingCurve, DampingStatus, Phasors
+from estimators.curve_basis import CurveBasis, PiecewiseLinear, Quadratic
+from estimators.curve_filter import CurveFilter
+from estimators.force_balance import AbsorberBalance, ForceBalance
+from estimators.types import DampingCurve, DampingStatus
 from twin.plant.config import DampingTable, Plant
 from twin.plant.linear import Array, read_only
 
+__all__ = ["AbsorberBalance", "DampingLearner", "ForceBalance", "LearnerSettings"]
 
-@dataclass(frozen=True, slots=True)
-class ForceBalance:
-    """Damping [Ns/m] and stiffness [N/m] of one block, with standard deviations from its own noise."""
+STRAYS_BELIEVED = 5
+"""So many outliers in a row are no outliers: it is the curve that is wrong, where they are."""
 
-    frequency_hz: float
-    damping_ns_m: float
-    damping_std_ns_m: float
-    stiffness_n_m: float
-    stiffness_std_n_m: float
-    transient_1_s: float
-    """How fast the relative motion's amplitude or phase moves, |A'/A|."""
-
-
-class AbsorberBalance:
-    """The force balance of one plant's absorber on block phasors.
-
-    Parameters
-    ----------
-    plant
-        Gives the absorber's mass, the coil and its force constant.
-    channels
-        Names of a block's columns.
-
-    Raises
-    ------
-    ValueError
-        If the plant has no voice coil on an absorber, or its accelerations or current are not recorded.
-    """
-
-    def __init__(self, plant: Plant, channels: tuple[str, ...]) -> None:
-        coil = plant.voice_coil
-        absorber = plant.absorber
-        if coil is None or coil.between is None or absorber is None:
-            raise ValueError("no voice coil acts between two bodies")
-        self.mass_kg = absorber.mass_kg
-        self.force_constant_n_a = coil.force_constant_n_a
-        first, second = coil.between
-        self._first = _column(plant, channels, "acceleration", first)
-        self._second = _column(plant, channels, "acceleration", second)
-        self._current = _column(plant, channels, "current", coil.name)
-
-    def solve(self, phasors: Phasors) -> ForceBalance:
-        """Damping and stiffness of one block."""
-        w = math.tau * phasors.frequency_hz
-        a1, a2 = phasors.amplitude[self._first], phasors.amplitude[self._second]
-        relative = complex(a2 - a1)
-        drift = complex(phasors.slope[self._second] - phasors.slope[self._first])
-        # A moving amplitude: v' + jw v = a, so that v = (a - a'/(jw))/(jw) to first order in the drift.
-        velocity = (relative - drift / (1j * w)) / (1j * w)
-        displacement = (relative - 2.0 * drift / (1j * w)) / (1j * w) ** 2
-        force = self.force_constant_n_a * complex(phasors.amplitude[self._current]) - self.mass_kg * complex(
-            a2
-        )
-        matrix = np.array([[displacement.real, velocity.real], [displacement.imag, velocity.imag]])
-        if abs(np.linalg.det(matrix)) < 1e-300:
-            return ForceBalance(phasors.frequency_hz, math.nan, math.inf, math.nan, math.inf, math.inf)
-        stiffness, damping = np.linalg.solve(matrix, [force.real, force.imag])
-        dynamic = stiffness / w**2 - damping / (1j * w)
-        noise = (
-            self.force_constant_n_a**2 * phasors.variance[self._current]
-            + abs(dynamic - self.mass_kg) ** 2 * phasors.variance[self._second]
-            + abs(dynamic) ** 2 * phasors.variance[self._first]
-        )
-        std = math.sqrt(0.5 * noise)
-        return ForceBalance(
-            frequency_hz=phasors.frequency_hz,
-            damping_ns_m=float(damping),
-            damping_std_ns_m=std / abs(velocity),
-            stiffness_n_m=float(stiffness),
-            stiffness_std_n_m=std / abs(displacement),
-            transient_1_s=abs(drift) / abs(relative) if relative != 0.0 else math.inf,
-        )
+BLOCKS_FOR_ESTIMATE = 10
+STIFFNESS_PRIOR_SHARE, STIFFNESS_LENGTH_HZ = 0.1, 30.0
+MISFIT_MEMORY_S, MISFIT_ALLOWED, MOST_MISFIT = 3.0, 1.5, 9.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,48 +29,80 @@ class LearnerSettings:
 
     Attributes
     ----------
+    basis
+        Family of curves: ``piecewise_linear`` supposes no shape, ``quadratic`` is the thesis's fit.
     from_hz, to_hz, step_hz
-        Knots of the piecewise-linear curve [Hz].
+        Knots at which the curve is told [Hz].
     prior_std_ns_m, prior_length_hz
         Before anything is measured, the curve may be off by this much, alike over about this many hertz.
     forgetting_ns_m_sqrt_s
-        Random walk of the knots beside the excitation [Ns/m per sqrt(s)]; the others keep what they know.
+        Random walk of the damping at the excitation [Ns/m per sqrt(s)], once readings there are further from the
+        curve than their noise explains; elsewhere what is known stays known.
     floor_std_ns_m
-        No single block is believed better than this: phase of sensors, curvature between knots.
-    transient_std_ns
-        And by so much less the faster its amplitudes move [Ns/m per 1/s].
+        No single block is believed better than this: curvature between knots.
     floor_std_n_m
         The stiffness is not believed better than this, however many blocks agree [N/m].
+    timing_std_s
+        Delay of any of the channels against the others is known no better than this; one sample at 50 kS/s.
     rate_limit_ns_m_s
         How fast the value in use follows the learned one.
     max_block_std_ns_m, max_transient_1_s
         Gates: a block with less excitation, or faster transients, is not taken in.
+    settle_s
+        Nor are blocks that begin less than this after a transient, a jump or an objection.
     outlier_sigmas
         A block further from the curve than this is not taken in, unless it is one of several in a row.
+    wanted_from_hz, wanted_to_hz, wanted_std_ns_m
+        Progress is complete when the damping is known that well in this band.
     """
 
+    basis: Literal["piecewise_linear", "quadratic"] = "piecewise_linear"
     from_hz: float = 35.0
     to_hz: float = 65.0
-    step_hz: float = 1.0
+    step_hz: float = 0.5
     prior_std_ns_m: float = 8.0
     prior_length_hz: float = 10.0
-    forgetting_ns_m_sqrt_s: float = 0.05
-    floor_std_ns_m: float = 0.03
-    transient_std_ns: float = 0.3
+    forgetting_ns_m_sqrt_s: float = 0.3
+    floor_std_ns_m: float = 0.005
     floor_std_n_m: float = 5.0
+    timing_std_s: float = 20e-6
     rate_limit_ns_m_s: float = 5.0
     max_block_std_ns_m: float = 1.0
     max_transient_1_s: float = 1.0
+    settle_s: float = 0.1
     outlier_sigmas: float = 6.0
+    wanted_from_hz: float = 45.0
+    wanted_to_hz: float = 55.0
+    wanted_std_ns_m: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuse settings that no curve can be learned with."""
+        if self.basis not in ("piecewise_linear", "quadratic"):
+            raise ValueError(f"basis '{self.basis}' is not known; give piecewise_linear or quadratic")
+        for name, value in asdict(self).items():
+            if name != "basis" and not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} = {value} must be finite and not below 0")
+        if not (self.from_hz < self.to_hz and 0.0 < self.step_hz <= self.to_hz - self.from_hz):
+            raise ValueError(
+                "from_hz must be below to_hz [Hz], and step_hz above 0 and no more than between them"
+            )
+        if not (self.prior_std_ns_m > 0.0 and self.prior_length_hz > 0.0 and self.wanted_std_ns_m > 0.0):
+            raise ValueError("prior_std_ns_m, prior_length_hz and wanted_std_ns_m must be above 0")
+
+    def curve_basis(self) -> CurveBasis:
+        """Return the family of curves."""
+        if self.basis == "quadratic":
+            return Quadratic(self.from_hz, self.to_hz, self.step_hz)
+        return PiecewiseLinear(self.from_hz, self.to_hz, self.step_hz)
 
 
 class DampingLearner:
-    """A Kalman filter on the knots of a piecewise-linear damping curve.
+    """What is known of the coil's damping and the absorber's stiffness against frequency.
 
     Parameters
     ----------
     plant
-        Gives the curve to start from.
+        Gives the curves to start from.
     """
 
     def __init__(self, plant: Plant, settings: LearnerSettings | None = None) -> None:
@@ -147,16 +110,26 @@ class DampingLearner:
         if absorber is None:
             raise ValueError("the plant has no absorber")
         self.settings = settings = settings or LearnerSettings()
-        self._knots = np.arange(settings.from_hz, settings.to_hz + 0.5 * settings.step_hz, settings.step_hz)
-        self._mean = np.array([absorber.damping_at(f) for f in self._knots])
-        self._in_use = self._mean.copy()
-        distance = np.abs(self._knots[:, None] - self._knots[None, :])
-        self._prior = settings.prior_std_ns_m**2 * np.exp(-distance / settings.prior_length_hz)
-        self._covariance = self._prior.copy()
+        basis = settings.curve_basis()
+        self._knots = basis.knots_hz
+        self._damping = CurveFilter(
+            basis,
+            np.array([absorber.damping_at(float(f)) for f in self._knots]),
+            settings.prior_std_ns_m,
+            settings.prior_length_hz,
+        )
+        self._stiffness = CurveFilter(
+            basis,
+            np.full(len(self._knots), absorber.stiffness_n_m),
+            STIFFNESS_PRIOR_SHARE * absorber.stiffness_n_m,
+            STIFFNESS_LENGTH_HZ,
+        )
+        self._in_use = np.maximum(self._damping.values, 0.0)
         self._accepted = self._strays = 0
+        self._last_hz = math.nan
+        self._misfit = 1.0
+        self._settling_s = 0.0
         self._reason = "nothing measured yet"
-        self._stiffness, self._stiffness_variance = math.nan, math.inf
-        self._stiffness_weight = self._stiffness_scatter = 0.0
 
     def advance(self, balance: ForceBalance | None, elapsed_s: float, objection: str = "") -> DampingCurve:
         """Take one block in, unless a gate objects, and move the value in use.
@@ -170,32 +143,46 @@ class DampingLearner:
         objection
             Reason of the caller's not to learn from this block.
         """
-        self._reason = objection or self._gate(balance)
+        unsettled = objection or self._unsettled(balance)
+        if unsettled:
+            self._settling_s = self.settings.settle_s
+            self._reason = unsettled
+        else:
+            self._reason = self._gate(balance)
+            self._settling_s -= elapsed_s
         if balance is not None and not self._reason:
             self._take(balance, elapsed_s)
         step = self.settings.rate_limit_ns_m_s * elapsed_s
-        wanted = np.maximum(self._mean, 0.0)
+        wanted = np.maximum(self._damping.values, 0.0)
         self._in_use += np.clip(wanted - self._in_use, -step, step)
         return self.curve()
 
     def warm_up(self) -> None:
         """Compile what a block needs, on copies."""
-        scalar_update(self._mean.copy(), self._covariance.copy(), np.zeros(len(self._mean)), 1.0, 0.0)
+        self._damping.warm_up()
 
     def curve(self) -> DampingCurve:
         """Copy of what is known at present."""
-        variance = np.maximum(np.diag(self._covariance), 0.0)
-        coverage = np.clip(1.0 - variance / np.diag(self._prior), 0.0, 1.0)
+        timing = self.settings.timing_std_s
+        std = self._damping.std(timing)
+        stiffness, stiffness_std = self._stiffness.values, self._stiffness_std()
+        here = self._last_hz if self._accepted else 0.0
         return DampingCurve(
             frequency_hz=read_only(self._knots),
-            damping_ns_m=read_only(self._mean),
-            std_ns_m=read_only(np.sqrt(variance)),
+            damping_ns_m=read_only(self._damping.values),
+            std_ns_m=read_only(std),
+            noise_std_ns_m=read_only(self._damping.noise_std),
             in_use_ns_m=read_only(self._in_use),
-            coverage=read_only(coverage),
+            coverage=read_only(self._damping.coverage),
             status=self._status(),
+            progress=self._progress(std),
             reason=self._reason,
-            stiffness_n_m=self._stiffness,
-            stiffness_std_n_m=math.sqrt(self._stiffness_variance) if self._accepted else math.nan,
+            stiffness_n_m=self._stiffness.at(here) if self._accepted else math.nan,
+            stiffness_std_n_m=float(np.interp(here, self._knots, stiffness_std))
+            if self._accepted
+            else math.nan,
+            stiffness_curve_n_m=read_only(stiffness),
+            stiffness_curve_std_n_m=read_only(stiffness_std),
         )
 
     def table(self) -> DampingTable:
@@ -206,28 +193,69 @@ class DampingLearner:
 
     def std_at(self, frequency_hz: float) -> float:
         """Standard deviation of the learned value at a frequency [Ns/m]."""
-        h = self._weights(frequency_hz)
-        return math.sqrt(max(float(h @ self._covariance @ h), 0.0))
+        return self._damping.std_at(frequency_hz, self.settings.timing_std_s)
 
-    def _take_stiffness(self, balance: ForceBalance) -> None:
-        """Weighted mean of the blocks' stiffness; its scatter from block to block says how well it is known."""
-        noise = balance.stiffness_std_n_m**2 + (self.settings.floor_std_n_m**2)
-        previous = self._stiffness if self._accepted else balance.stiffness_n_m
-        innovation = balance.stiffness_n_m - previous
-        self._stiffness_weight += 1.0 / noise
-        step = innovation / (noise * self._stiffness_weight)
-        self._stiffness = previous + step
-        self._stiffness_scatter += innovation * (innovation - step) / noise
-        # Blocks disagree by more than their noise: model error, shared by neighbours, does not average away.
-        excess = max(1.0, self._stiffness_scatter / max(self._accepted, 1))
-        self._stiffness_variance = excess * (1.0 / self._stiffness_weight + self.settings.floor_std_n_m**2)
+    def state(self) -> dict[str, Any]:
+        """What has been learned, as plain data that `restored` reads back."""
+        return {
+            "settings": asdict(self.settings),
+            "damping": self._damping.state(),
+            "stiffness": self._stiffness.state(),
+            "in_use_ns_m": self._in_use.tolist(),
+            "blocks": self._accepted,
+            "last_hz": self._last_hz if self._accepted else 0.0,
+        }
+
+    @classmethod
+    def restored(cls, state: dict[str, Any], plant: Plant) -> "DampingLearner":
+        """Learner that goes on from what `state` gave.
+
+        Raises
+        ------
+        ValueError, KeyError, TypeError
+            If it is not that.
+        """
+        learner = cls(plant, LearnerSettings(**state["settings"]))
+        learner._damping.restore(state["damping"])
+        learner._stiffness.restore(state["stiffness"])
+        in_use = np.array(state["in_use_ns_m"], dtype=np.float64)
+        if in_use.shape != learner._knots.shape or not np.all(in_use >= 0.0) or not np.isfinite(in_use).all():
+            raise ValueError("in_use_ns_m must hold one finite damping of at least 0 Ns/m per knot")
+        learner._in_use = in_use
+        learner._accepted, learner._last_hz = int(state["blocks"]), float(state["last_hz"])
+        if learner._accepted < 0 or not math.isfinite(learner._last_hz):
+            raise ValueError("blocks and last_hz must be finite and not below 0")
+        learner._reason = "read from a file; nothing measured since"
+        return learner
+
+    def _stiffness_std(self) -> Array:
+        return np.hypot(self._stiffness.std(self.settings.timing_std_s), self.settings.floor_std_n_m)
+
+    def _progress(self, std: Array) -> float:
+        """0 where the prior stands to 1 where the wanted band is known as well as wanted, in decades of std."""
+        s = self.settings
+        inside = (self._knots >= s.wanted_from_hz) & (self._knots <= s.wanted_to_hz)
+        if not inside.any() or s.wanted_std_ns_m >= s.prior_std_ns_m:
+            return 1.0
+        share = np.log(s.prior_std_ns_m / np.maximum(std[inside], s.wanted_std_ns_m))
+        return float(np.clip(np.mean(share) / math.log(s.prior_std_ns_m / s.wanted_std_ns_m), 0.0, 1.0))
 
     def _status(self) -> DampingStatus:
-        if not np.all(np.isfinite(self._mean)):
+        if not np.all(np.isfinite(self._damping.values)):
             return "invalid"
         if self._accepted == 0:
             return "unestimated"
-        return "estimated" if self._accepted >= 10 and not self._reason else "learning"
+        return "estimated" if self._accepted >= BLOCKS_FOR_ESTIMATE and not self._reason else "learning"
+
+    def _unsettled(self, balance: ForceBalance | None) -> str:
+        """Why a block and those soon after it are no steady state."""
+        if balance is None:
+            return "no excitation"
+        if not balance.steady:
+            return "excitation has jumped"
+        if math.isfinite(balance.transient_1_s) and balance.transient_1_s > self.settings.max_transient_1_s:
+            return "transient"
+        return ""
 
     def _gate(self, balance: ForceBalance | None) -> str:
         settings = self.settings
@@ -237,41 +265,40 @@ class DampingLearner:
             return f"excitation outside {settings.from_hz:g} to {settings.to_hz:g} Hz"
         if not balance.damping_std_ns_m <= settings.max_block_std_ns_m:
             return "too little excitation"
-        if balance.transient_1_s > settings.max_transient_1_s:
-            return "transient"
-        h = self._weights(balance.frequency_hz)
-        sigma = math.sqrt(float(h @ self._covariance @ h) + self._variance(balance))
-        if abs(balance.damping_ns_m - float(h @ self._mean)) > settings.outlier_sigmas * sigma:
+        if self._settling_s > 1e-9:
+            return "settling"
+        if abs(self._surprise(balance)) > settings.outlier_sigmas:
             self._strays += 1
-            if self._strays < 5:
+            if self._strays < STRAYS_BELIEVED:
                 return "outlier"
-            # Several in a row: it is the curve that is wrong, here; what is known elsewhere stays known.
-            self._covariance += np.diag((h > 0.0) * np.diag(self._prior))
+            self._damping.forget(balance.frequency_hz, settings.prior_std_ns_m**2)
         self._strays = 0
         return ""
 
     def _take(self, balance: ForceBalance, elapsed_s: float) -> None:
-        settings = self.settings
-        h = self._weights(balance.frequency_hz)
-        self._covariance += np.diag(h * settings.forgetting_ns_m_sqrt_s**2 * elapsed_s)
-        scalar_update(self._mean, self._covariance, h, self._variance(balance), balance.damping_ns_m)
-        self._covariance = 0.5 * (self._covariance + self._covariance.T)
-        self._take_stiffness(balance)
+        settings, f = self.settings, balance.frequency_hz
+        keep = math.exp(-elapsed_s / MISFIT_MEMORY_S)
+        self._misfit = keep * self._misfit + (1.0 - keep) * min(self._surprise(balance) ** 2, MOST_MISFIT)
+        # Forgetting has a price in certainty; it is paid where readings ask for it.
+        excess = max(self._misfit - MISFIT_ALLOWED, 0.0)
+        if excess > 0.0:
+            self._damping.forget(f, excess * settings.forgetting_ns_m_sqrt_s**2 * elapsed_s)
+        self._damping.take(f, balance.damping_ns_m, self._variance(balance), balance.damping_per_delay_ns_m_s)
+        self._stiffness.take(
+            f, balance.stiffness_n_m, balance.stiffness_std_n_m**2 + 1.0, balance.stiffness_per_delay_n_m_s
+        )
         self._accepted += 1
+        self._last_hz = f
+
+    def _surprise(self, balance: ForceBalance) -> float:
+        return self._damping.surprise(
+            balance.frequency_hz,
+            balance.damping_ns_m,
+            self._variance(balance),
+            balance.damping_per_delay_ns_m_s,
+            self.settings.timing_std_s,
+        )
 
     def _variance(self, balance: ForceBalance) -> float:
-        """Variance of a block's damping [(Ns/m)²]: its noise, and what the phasors of a moving state get wrong."""
-        settings = self.settings
-        model_error = settings.floor_std_ns_m + settings.transient_std_ns * balance.transient_1_s
-        return balance.damping_std_ns_m**2 + model_error**2
-
-    def _weights(self, frequency_hz: float) -> Array:
-        """Hat functions of the knots at a frequency."""
-        return np.maximum(0.0, 1.0 - np.abs(self._knots - frequency_hz) / self.settings.step_hz)
-
-
-def _column(plant: Plant, channels: tuple[str, ...], kind: str, of: str) -> int:
-    for sensor in plant.sensor:
-        if sensor.kind == kind and sensor.of == of and sensor.name in channels:
-            return channels.index(sensor.name)
-    raise ValueError(f"no recorded sensor measures the {kind} of '{of}'")
+        """Variance of a block's damping [(Ns/m)²]."""
+        return balance.damping_std_ns_m**2 + self.settings.floor_std_ns_m**2

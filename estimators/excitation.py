@@ -1,8 +1,8 @@
-"""Excitation tracker and lock-in: frequency of the excitation, and every channel's phasor at it.
+"""Excitation tracker: frequency of the excitation from block to block, and every channel's phasor at it.
 
-Per block, all channels are fitted by least squares with ``Re{(A + S (t - t_mid)) exp(j phi(t))} + offset``, where
-``phi`` is the tracked phase of the excitation, its sweep rate included. The slope S makes the phasors right while
-amplitudes move, and its imaginary part on the reference channel is what the tracker corrects its frequency by.
+The phase is carried on through gaps, sweeps and jumps. A block is fitted once, at the phase that the blocks before
+it predict; what the reference's phasor turns by within the block corrects the frequency, and only where that is
+more than a hair the fit is repeated.
 """
 
 import math
@@ -11,10 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.lockin import LockIn, Samples, averaged, colour, lock_in, strongest_hz
 from estimators.types import Phasors
 from twin.plant.blocks import Block
 from twin.plant.config import Plant, Shaker
-from twin.plant.linear import Array, ComplexArray
+from twin.plant.linear import Array
 
 MIN_VALID_SHARE = 0.5
 MIN_CYCLES = 1.5
@@ -22,6 +23,23 @@ MIN_CYCLES = 1.5
 
 LOST_SIGNAL_RATIO = 5.0
 """Amplitude over its standard deviation below which a reference tells no frequency."""
+
+SMALL_TURN_RAD = 2e-3
+"""Half of what the phasor turns by in a block may be this much before the block is fitted again."""
+
+MAX_FITS = 8
+POOR_FIT = 0.02
+"""Residual power over the tone's: with more the tracker looks whether it follows the wrong tone."""
+
+RATE_WALK_HZ_S = 0.5
+"""Random walk of the sweep rate [Hz/s per sqrt(s)]; faster changes are taken for a break of its course."""
+
+BREAK_SIGMAS = 6.0
+NEW_RATE_STD_HZ_S = 3.0
+COLOUR_MEMORY_S = 1.5
+COLOUR_PRIOR_BINS = 4.0
+SUDDEN_NOISE = 10.0
+"""A block that is noisier beside the excitation than the blocks before by this factor is judged by itself."""
 
 
 def choose_reference(plant: Plant, channels: Sequence[str]) -> str | None:
@@ -63,128 +81,192 @@ class ExcitationTracker:
         self.channels = tuple(channels)
         self._column = self.channels.index(reference)
         self._band = band_hz
-        self._frequency: float | None = None  # at the end of the last block [Hz]
-        self._rate = 0.0  # Hz/s
-        self._phase = 0.0  # at the end of the last block [rad]
-        self._age = 0
+        self._course: _Course | None = None
+        self._next_sample: int | None = None
+        self._colour = _RunningColour(len(self.channels))
 
     def advance(self, block: Block) -> Phasors | None:
-        """Phasors of one block; None while there is no excitation to track."""
+        """Phasors of one block; None while there is no excitation to track.
+
+        A channel with less than half of its samples has an amplitude of zero with infinite variance.
+        """
         dt = 1.0 / block.sample_rate_hz
-        rows = block.valid.all(axis=1)
         n = block.n_samples
-        if n < 8 or rows.sum() < max(8, MIN_VALID_SHARE * n):
+        self._cross_gap(block, dt)
+        found = self._usable(block) if n >= 8 else None
+        if found is None:
             self._coast(n * dt)
             return None
-        values = block.values if rows.all() else block.values[rows]
-        t = (np.arange(n) - 0.5 * (n - 1)) * dt
-        t_used = t if rows.all() else t[rows]
-        half = 0.5 * n * dt
-        signal = values[:, self._column]
+        live, rows = found
+        values = block.values if live.all() else np.where(live, block.values, 0.0)
         band = (max(self._band[0], MIN_CYCLES / (n * dt)), min(self._band[1], 0.45 / dt))
-
-        searching = self._frequency is None
-        if self._frequency is None:
-            strongest = _search(signal, dt, (self._band[0], band[1]))
-            if strongest < band[0]:
+        samples = averaged(values, dt, self._expected_hz(band), None if rows.all() else rows)
+        searched = self._course is None
+        if self._course is None:
+            strongest = self._search(samples, band)
+            if strongest is None:
                 return None
-            self._frequency, self._rate, self._age = strongest, 0.0, 0
-        f_mid = self._frequency + self._rate * half
-        phase_mid = self._phase + math.tau * (self._frequency + 0.5 * self._rate * half) * half
-        fit = None
-        for _ in range(6 if searching else 2):
-            fit = _fit(t_used, values[:, self._column : self._column + 1], phase_mid, f_mid, self._rate)
-            amplitude, slope = complex(fit[0][0]), complex(fit[1][0])
-            if abs(amplitude) == 0.0:
-                break
-            correction = (slope / amplitude).imag / math.tau
-            f_mid += float(np.clip(correction, -0.5 / half, 0.5 / half))
-        if not band[0] <= f_mid <= band[1]:
-            self._frequency = None
+            self._course = _Course(strongest)
+            samples = averaged(values, dt, strongest, None if rows.all() else rows)
+        course = self._course
+        half = 0.5 * n * dt
+        course.go_on(half)
+        rate = course.rate
+        fit, f_mid = self._converge(samples, course)
+        if _poor(fit, self._column) and not searched:
+            other = self._search(samples, band)
+            if other is not None and abs(other - f_mid) * n * dt > 0.5:
+                better, hz = self._converge(samples, course, other)
+                if better.residual_variance[self._column] < fit.residual_variance[self._column]:
+                    fit, f_mid = better, hz
+        size = abs(complex(fit.amplitude[self._column]))
+        if not band[0] <= f_mid <= band[1] or size**2 <= LOST_SIGNAL_RATIO**2 * fit.variance[self._column]:
+            self._course = None
             return None
-        amplitude_, slope_, variance, slope_variance = _fit(t_used, values, phase_mid, f_mid, self._rate)
-        a_ref = complex(amplitude_[self._column])
-        if abs(a_ref) ** 2 <= LOST_SIGNAL_RATIO**2 * variance[self._column]:
-            self._frequency = None
-            return None
-
-        # Second-order tracking: what the middle frequency moved since the last block's is the sweep rate.
-        predicted_mid = self._frequency + self._rate * half
-        gain = 1.0 if self._age == 1 else 0.2
-        if self._age >= 1:
-            self._rate += gain * (f_mid - predicted_mid) / (2.0 * half)
-        self._age += 1
-        self._frequency = f_mid + self._rate * half
-        self._phase = math.remainder(
-            phase_mid + math.tau * (f_mid + 0.5 * self._rate * half) * half, math.tau
-        )
-        f_std = math.sqrt(0.5 * slope_variance[self._column]) / (math.tau * abs(a_ref))
+        noise = self._colour.take(fit, n * dt)
+        variance, slope_variance = fit.variance * noise, fit.slope_variance * noise
+        sample_variance = fit.residual_variance * noise
+        f_std = math.sqrt(0.5 * slope_variance[self._column]) / (math.tau * size)
+        steady = course.correct(f_mid, f_std) and not searched
+        course.go_on(half)
+        dead = ~live
+        if dead.any():
+            fit.amplitude[dead], fit.slope[dead], fit.harmonics[:, dead] = 0.0, 0.0, 0.0
+            fit.harmonic_variance[:, dead] = math.inf
+            variance[dead] = slope_variance[dead] = sample_variance[dead] = math.inf
         return Phasors(
             frequency_hz=f_mid,
             frequency_std_hz=f_std,
+            sweep_rate_hz_s=rate,
+            steady=steady,
             reference=self.reference,
             channels=self.channels,
-            amplitude=amplitude_,
-            slope=slope_,
+            amplitude=fit.amplitude,
+            slope=fit.slope,
             variance=variance,
+            slope_variance=slope_variance,
+            harmonic_orders=fit.orders,
+            harmonics=fit.harmonics,
+            harmonic_variance=fit.harmonic_variance,
+            samples=fit.filled,
+            sample_variance=sample_variance,
+            duration_s=n * dt,
         )
 
+    def _usable(self, block: Block) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+        """Channels with enough samples, and rows where all of those are valid; None if that is not enough."""
+        if block.valid.all():
+            return np.ones(block.valid.shape[1], dtype=np.bool_), np.ones(block.n_samples, dtype=np.bool_)
+        least = max(8, math.ceil(MIN_VALID_SHARE * block.n_samples))
+        count = np.count_nonzero(block.valid, axis=0)
+        live = count >= least
+        if not live[self._column]:
+            return None
+        rows = np.asarray(block.valid[:, live].all(axis=1))
+        return (live, rows) if np.count_nonzero(rows) >= least else None
+
+    def _converge(
+        self, samples: Samples, course: "_Course", start_hz: float | None = None
+    ) -> tuple[LockIn, float]:
+        """Fit until the reference's phasor stands still; slopes are then told against that frequency."""
+        f_mid = course.frequency if start_hz is None else start_hz
+        rate = course.rate if start_hz is None else 0.0
+        half = 0.5 * samples.duration_s
+        for _ in range(MAX_FITS):
+            fit = lock_in(samples, course.phase, f_mid, rate)
+            amplitude = complex(fit.amplitude[self._column])
+            if amplitude == 0.0:
+                break
+            correction = (complex(fit.slope[self._column]) / amplitude).imag / math.tau
+            correction = min(max(correction, -0.5 / half), 0.5 / half)
+            if abs(correction) * math.tau * half < SMALL_TURN_RAD:
+                fit.slope[:] -= 1j * math.tau * correction * fit.amplitude
+                return fit, f_mid + correction
+            f_mid = max(f_mid + correction, 1e-3)
+        return fit, f_mid
+
+    def _search(self, samples: Samples, band: tuple[float, float]) -> float | None:
+        strongest = strongest_hz(samples, self._column, (self._band[0], band[1]))
+        return strongest if strongest >= band[0] else None
+
+    def _expected_hz(self, band: tuple[float, float]) -> float:
+        """Highest frequency that need be kept when samples are averaged [Hz]."""
+        # Twice the tracked one leaves room for a jump; without one to track, all of the band is kept.
+        return band[1] if self._course is None else min(1.3 * self._course.frequency, band[1])
+
+    def _cross_gap(self, block: Block, dt: float) -> None:
+        if self._next_sample is not None and block.first_sample != self._next_sample:
+            lost_s = (block.first_sample - self._next_sample) * dt
+            if lost_s > 0.0:
+                self._coast(lost_s)
+            else:  # another recording
+                self._course = None
+        self._next_sample = block.end_sample
+
     def _coast(self, duration_s: float) -> None:
-        if self._frequency is not None:
-            self._phase += math.tau * (self._frequency + 0.5 * self._rate * duration_s) * duration_s
-            self._phase = math.remainder(self._phase, math.tau)
-            self._frequency += self._rate * duration_s
+        if self._course is not None:
+            self._course.go_on(duration_s)
 
 
-def _search(signal: Array, dt: float, band_hz: tuple[float, float]) -> float:
-    """Strongest frequency in the band [Hz], from a Hann-windowed, zero-padded spectrum."""
-    n = len(signal)
-    windowed = (signal - signal.mean()) * np.hanning(n)
-    size = 1 << max(14, (8 * n - 1).bit_length())
-    spectrum = np.abs(np.fft.rfft(windowed, size))
-    frequency = np.fft.rfftfreq(size, dt)
-    inside = (frequency >= band_hz[0]) & (frequency <= band_hz[1])
-    if not inside.any():
-        inside = frequency > 0.0
-    return float(frequency[inside][np.argmax(spectrum[inside])])
+class _Course:
+    """Phase, frequency and sweep rate as they go on: a Kalman filter on the blocks' frequencies."""
+
+    def __init__(self, frequency_hz: float) -> None:
+        self.frequency, self.rate, self.phase = frequency_hz, 0.0, 0.0
+        self._new = True
+        self._variance = np.diag([1.0, NEW_RATE_STD_HZ_S**2])
+
+    def go_on(self, duration_s: float) -> None:
+        """Let time pass."""
+        d = duration_s
+        self.phase += math.tau * (self.frequency + 0.5 * self.rate * d) * d
+        self.phase = math.remainder(self.phase, math.tau)
+        self.frequency += self.rate * d
+        step = np.array([[1.0, d], [0.0, 1.0]])
+        walk = RATE_WALK_HZ_S**2 * np.array([[d**3 / 3.0, 0.5 * d**2], [0.5 * d**2, d]])
+        self._variance = step @ self._variance @ step.T + walk
+
+    def correct(self, frequency_hz: float, std_hz: float) -> bool:
+        """Take a block's frequency in; returns whether it lies on the course so far."""
+        P = self._variance
+        s = P[0, 0] + std_hz**2 + 1e-14
+        innovation = frequency_hz - self.frequency
+        if abs(innovation) > BREAK_SIGMAS * math.sqrt(s):
+            self.frequency, self.rate = frequency_hz, 0.0
+            self._variance = np.diag([max(std_hz, 0.1) ** 2, NEW_RATE_STD_HZ_S**2])
+            self._new = False
+            return False
+        gain = P[:, 0] / s
+        self.frequency += float(gain[0]) * innovation
+        if not self._new:  # the first block's frequency, found by search, has no rate in it
+            self.rate += float(gain[1]) * innovation
+        self._new = False
+        self._variance = P - np.outer(gain, P[0])
+        return True
 
 
-def _fit(
-    t: NDArray[np.floating], values: Array, phase_mid: float, f_mid: float, rate: float
-) -> tuple[ComplexArray, ComplexArray, NDArray[np.float64], NDArray[np.float64]]:
-    """Least-squares phasors of all channels.
+class _RunningColour:
+    """Noise at the excitation over that of a white residual, per channel, over the last blocks."""
 
-    Parameters
-    ----------
-    t
-        (N,) time from the block's middle [s].
-    values
-        (N, p) samples.
+    def __init__(self, n_channels: int) -> None:
+        self._bins = COLOUR_PRIOR_BINS
+        self._sum = np.full(n_channels, COLOUR_PRIOR_BINS)
 
-    Returns
-    -------
-    amplitude, slope
-        (p,) complex.
-    variance, slope_variance
-        (p,) of each complex number, E|error|², from the residual's own variance.
-    """
-    phase = phase_mid + math.tau * (f_mid + 0.5 * rate * t) * t
-    basis = np.empty((5, len(t)))
-    np.cos(phase, out=basis[0])
-    np.sin(phase, out=basis[1])
-    basis[1] *= -1.0
-    scale = max(float(np.max(np.abs(t))), 1e-12)
-    basis[2] = basis[0] * (t / scale)
-    basis[3] = basis[1] * (t / scale)
-    basis[4] = 1.0
-    inverse = np.linalg.pinv(basis @ basis.T)
-    projected = basis @ values
-    solution = inverse @ projected
-    squares = np.einsum("ij,ij->j", values, values) - np.einsum("ij,ij->j", solution, projected)
-    residual = np.maximum(squares, 0.0) / max(len(t) - 5, 1)
-    return (
-        solution[0] + 1j * solution[1],
-        (solution[2] + 1j * solution[3]) / scale,
-        residual * (inverse[0, 0] + inverse[1, 1]),
-        residual * (inverse[2, 2] + inverse[3, 3]) / scale**2,
-    )
+    def take(self, fit: LockIn, duration_s: float) -> Array:
+        """Factor on the variances of this block, (p,)."""
+        bins = len(fit.steps)
+        if bins == 0:
+            return self._sum / self._bins
+        now = colour(fit)
+        before = self._sum / self._bins
+        sudden = now > SUDDEN_NOISE * before
+        keep = math.exp(-duration_s / COLOUR_MEMORY_S)
+        self._bins = keep * self._bins + bins
+        # One block of another kind must not be remembered for seconds.
+        self._sum = keep * self._sum + bins * np.where(sudden, SUDDEN_NOISE * before, now)
+        return np.asarray(np.where(sudden, now, self._sum / self._bins))
+
+
+def _poor(fit: LockIn, column: int) -> bool:
+    power = 0.5 * abs(complex(fit.amplitude[column])) ** 2
+    return bool(fit.residual_variance[column] > POOR_FIT * power)

@@ -1,0 +1,262 @@
+"""Coil damping and absorber stiffness of one block, from the absorber's own force balance.
+
+    m2 a2 + k2 (x2 - x1) + c2 (v2 - v1) = f_act
+
+holds for measured signals whatever the controller does with them, so that filter phase, which a damping found by
+turning gains until the table is quiet would contain, never enters. Locked in to the excitation its in-phase part
+gives k2, its quadrature part c2. The equation is taken against smooth test functions (`moments`), so that motion
+which grows, is swept or shaken from elsewhere keeps it too. Neither a model stiffness nor the controller's delay is
+used.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.balance_noise import BalanceNoise
+from estimators.moments import moments
+from estimators.types import Phasors
+from twin.plant.config import MOTION_UNITS, Plant
+from twin.plant.linear import Array, ComplexArray, read_only
+
+DERIVATIVES_MISSING = {kind: order for order, kind in enumerate(reversed(MOTION_UNITS))}
+"""How often a motion must be differentiated to become an acceleration."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForceBalance:
+    """Damping and stiffness of one block, with standard deviations from its own noise.
+
+    Attributes
+    ----------
+    damping_ns_m, damping_std_ns_m, stiffness_n_m, stiffness_std_n_m
+        Numbers in any case; the standard deviations are infinite where nothing can be told.
+    transient_1_s
+        How fast the relative motion's amplitude or phase moves, |A'/A|.
+    damping_per_delay_ns_m_s, stiffness_per_delay_n_m_s
+        (3,) what a second of delay in the motion of the first body, of the second, and in the current would add.
+        The three add up to nothing: a delay that all channels share does not matter.
+    steady
+        Whether the excitation's frequency went on as before.
+    """
+
+    frequency_hz: float
+    damping_ns_m: float
+    damping_std_ns_m: float
+    stiffness_n_m: float
+    stiffness_std_n_m: float
+    transient_1_s: float
+    damping_per_delay_ns_m_s: Array
+    stiffness_per_delay_n_m_s: Array
+    steady: bool = True
+
+
+class AbsorberBalance:
+    """The force balance of one plant's absorber on block phasors, block after block.
+
+    All recorded motions of the two bodies are used, weighted by their own noise. Noise that is common motion of
+    both bodies, a draught or a step on the floor, obeys the balance too and does not disturb it: what is left of it
+    is learned from the phasors beside the excitation, over the last blocks.
+
+    Parameters
+    ----------
+    plant
+        Gives the absorber's mass, the coil and its force constant.
+    channels
+        Names of a block's columns.
+
+    Raises
+    ------
+    ValueError
+        If the plant has no voice coil on an absorber, or its motion or current is not recorded.
+    """
+
+    def __init__(self, plant: Plant, channels: tuple[str, ...]) -> None:
+        coil = plant.voice_coil
+        absorber = plant.absorber
+        if coil is None or coil.between is None or absorber is None:
+            raise ValueError("no voice coil acts between two bodies")
+        self.mass_kg = absorber.mass_kg
+        self.force_constant_n_a = coil.force_constant_n_a
+        motions = _motions(plant, channels, coil.between)
+        current = _current(plant, channels, coil.name)
+        stated = {s.name: s.noise_density for s in plant.sensor}
+        self._columns = np.array([*(column for column, _, _ in motions), current])  # the current last
+        self._noise_density = np.array([stated[channels[column]] for column in self._columns])
+        self._orders = np.array([order for _, order, _ in motions])
+        self._geometry = np.array([weights for _, _, weights in motions])
+        self._balance_noise = BalanceNoise(len(motions) + 1)
+
+    def solve(self, phasors: Phasors) -> ForceBalance:
+        """Damping and stiffness of one block."""
+        w = math.tau * phasors.frequency_hz
+        variance = phasors.sample_variance[self._columns]
+        share = _weighted(self._geometry, w ** (2.0 * self._orders) * variance[:-1])
+        if share is None or not math.isfinite(variance[-1]):
+            return _nothing(phasors)
+        tests = self._tests(phasors, share)
+        of_stiffness, of_damping, force = (complex(part) for part in tests[0].terms)
+        matrix = np.array([[of_stiffness.real, of_damping.real], [of_stiffness.imag, of_damping.imag]])
+        if not abs(np.linalg.det(matrix)) > 1e-12 * abs(of_stiffness) * abs(of_damping):
+            return _nothing(phasors)
+        inverse = np.linalg.inv(matrix)
+        stiffness, damping = (float(v) for v in inverse @ [force.real, force.imag])
+        std = math.sqrt(0.5 * self._noise(tests, stiffness, damping))
+        late = -1j * w * tests[0].bodies_and_coil(stiffness, damping)
+        per_delay = inverse @ np.array([late.real, late.imag])
+        relative = self._relative(phasors, share)
+        return ForceBalance(
+            frequency_hz=phasors.frequency_hz,
+            damping_ns_m=damping,
+            damping_std_ns_m=std * float(np.linalg.norm(inverse[1])),
+            stiffness_n_m=stiffness,
+            stiffness_std_n_m=std * float(np.linalg.norm(inverse[0])),
+            transient_1_s=relative,
+            damping_per_delay_ns_m_s=read_only(per_delay[1]),
+            stiffness_per_delay_n_m_s=read_only(per_delay[0]),
+            steady=phasors.steady,
+        )
+
+    def _tests(self, phasors: Phasors, share: Array) -> list["_Test"]:
+        """The balance against each test function of a block."""
+        found = moments(
+            phasors.samples[:, self._columns],
+            phasors.duration_s,
+            phasors.frequency_hz,
+            2 + int(self._orders.max()),
+        )
+        full, grams = found.against_derivatives, found.gram
+        # <a, psi^(m)> = (-1)^n <y, psi^(m+n)> for y that lacks n derivatives, m = 0, 1, 2.
+        rows, motions = np.arange(3)[:, None] + self._orders, np.arange(len(self._orders))
+        accelerations = ((-1.0) ** self._orders * full[:, rows, motions]) @ share.T
+        # In a channel's own residual common motion would count as noise: that of its sensor is the measure.
+        variance = self._noise_density**2 * (0.5 * len(phasors.samples) / phasors.duration_s)
+        return [
+            _Test(
+                accelerations=accelerations[k],
+                coil_force=self.force_constant_n_a * complex(full[k, 2, -1]),
+                mass_kg=self.mass_kg,
+                share=share,
+                orders=self._orders,
+                gram=grams[k],
+                motion_variance=variance[:-1],
+                force_variance=self.force_constant_n_a**2 * float(variance[-1]),
+            )
+            for k in range(len(full))
+        ]
+
+    def _relative(self, phasors: Phasors, share: Array) -> float:
+        """|A'/A| of the relative motion [1/s]."""
+        turn = (2j * math.pi * phasors.frequency_hz) ** self._orders
+        difference = (share[1] - share[0]) * turn
+        size = abs(complex(difference @ phasors.amplitude[self._columns[:-1]]))
+        drift = abs(complex(difference @ phasors.slope[self._columns[:-1]]))
+        return drift / size if size > 0.0 else math.inf
+
+    def _noise(self, tests: list["_Test"], stiffness: float, damping: float) -> float:
+        """E|error|² of the balance at the excitation, the first of the tests; the others are beside it."""
+        excess = 1.0
+        if len(tests) > 1:
+            shares = np.array([test.noise_shares(stiffness, damping) for test in tests[1:]])
+            powers = np.array([test.error_power(stiffness, damping) for test in tests[1:]])
+            excess = self._balance_noise.take(shares, powers)
+        return excess * float(tests[0].noise_shares(stiffness, damping) @ self._balance_noise.factors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """``k2 <a_r, psi> - c2 <a_r, psi'> = <f_act - m2 a2, psi''>`` for one test function."""
+
+    accelerations: ComplexArray
+    """(3, 2) <a, psi^(m)> of both bodies."""
+    coil_force: complex
+    """<f_act, psi''>."""
+    mass_kg: float
+    share: Array
+    orders: Array
+    gram: ComplexArray
+    motion_variance: Array
+    force_variance: float
+
+    @property
+    def terms(self) -> tuple[complex, complex, complex]:
+        """What stands beside the stiffness, beside the damping, and on the other side."""
+        relative = self.accelerations[:, 1] - self.accelerations[:, 0]
+        return relative[0], -relative[1], self.coil_force - self.mass_kg * self.accelerations[2, 1]
+
+    def error_power(self, stiffness: float, damping: float) -> float:
+        """|error|² of the equation."""
+        return float(abs(complex(self.bodies_and_coil(stiffness, damping).sum())) ** 2)
+
+    def bodies_and_coil(self, stiffness: float, damping: float) -> ComplexArray:
+        """(3,) what the first body's motion, the second's and the coil's force add to the error."""
+        a = self.accelerations
+        dynamic = stiffness * a[0] - damping * a[1]
+        return np.array([dynamic[0], -dynamic[1] - self.mass_kg * a[2, 1], self.coil_force])
+
+    def noise_shares(self, stiffness: float, damping: float) -> Array:
+        """(n + 1,) E|error|² from the stated noise of each motion and of the current."""
+        bodies = np.array([[stiffness, -damping, 0.0], [-stiffness, damping, -self.mass_kg]])
+        of_channels = self.share.T @ bodies  # (n, 3) of psi, psi', psi''
+        shares = np.zeros(len(self.orders) + 1)
+        for c, n in enumerate(self.orders):
+            weights = of_channels[c]
+            if weights.any():
+                power = (weights @ self.gram[n : n + 3, n : n + 3] @ weights).real
+                shares[c] = power * self.motion_variance[c]
+        shares[-1] = self.force_variance * self.gram[2, 2].real
+        return shares
+
+
+def _nothing(phasors: Phasors) -> ForceBalance:
+    none = read_only(np.zeros(3))
+    return ForceBalance(
+        phasors.frequency_hz, 0.0, math.inf, 0.0, math.inf, math.inf, none, none, phasors.steady
+    )  # fmt: skip
+
+
+def _weighted(geometry: Array, variance: Array) -> Array | None:
+    """(2, n) weights that make two bodies' accelerations of n measured ones; None if those do not tell both."""
+    seen = np.isfinite(variance)
+    if np.linalg.matrix_rank(geometry[seen]) < 2:
+        return None
+    share = np.zeros((2, len(variance)))
+    if np.count_nonzero(seen) == 2:
+        share[:, seen] = np.linalg.inv(geometry[seen])
+        return share
+    floor = 1e-12 * max(float(variance[seen].max()), 1e-300)
+    weight = geometry[seen] / np.maximum(variance[seen], floor)[:, None]
+    share[:, seen] = np.linalg.solve(weight.T @ geometry[seen], weight.T)
+    return share
+
+
+def _motions(
+    plant: Plant, channels: tuple[str, ...], between: tuple[str, str]
+) -> list[tuple[int, int, tuple[float, float]]]:
+    """Column, derivatives missing and what it measures of the first and the second body."""
+    found = []
+    for sensor in plant.sensor:
+        if sensor.kind not in MOTION_UNITS or sensor.name not in channels:
+            continue
+        pair = (sensor.of,) if isinstance(sensor.of, str) else sensor.of
+        weights = dict(zip(pair, (1.0, -1.0), strict=False))
+        if set(weights) <= set(between):
+            of = (weights.get(between[0], 0.0), weights.get(between[1], 0.0))
+            found.append((channels.index(sensor.name), DERIVATIVES_MISSING[sensor.kind], of))
+    for body, place in zip(between, (0, 1), strict=True):
+        if not any(weights[place] for _, _, weights in found):
+            raise ValueError(f"no recorded sensor measures the motion of '{body}'")
+    if np.linalg.matrix_rank(np.array([weights for _, _, weights in found])) < 2:
+        raise ValueError(
+            f"the recorded sensors measure only the difference of '{between[0]}' and '{between[1]}': "
+            "one must measure either against the ground"
+        )
+    return found
+
+
+def _current(plant: Plant, channels: tuple[str, ...], coil: str) -> int:
+    for sensor in plant.sensor:
+        if sensor.kind == "current" and sensor.of == coil and sensor.name in channels:
+            return channels.index(sensor.name)
+    raise ValueError(f"no recorded sensor measures the current of '{coil}'")
