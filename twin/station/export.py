@@ -73,7 +73,7 @@ def hand_over(source: Source, options: ExportOptions, say: Callable[[str], None]
         budget = Budget(power_w=options.budget_w, kind=kind)
     watt, kind = (None, "joule_mean") if budget is None else (budget.power_w, budget.kind)
     points = point_figures(plant, facts, schedule, amplitude, watt, kind)
-    proof = check_transition(plant, facts, schedule, most_solves=3, enough_hz_s=ENOUGH_HZ_S)
+    proof = check_transition(plant, facts, schedule, most_solves=options.solves, enough_hz_s=ENOUGH_HZ_S)
     table, effect = _rounded(source, amplitude, options, say)
     absorber = plant.absorber
     return Handover(

@@ -30,7 +30,10 @@ SAMPLE_RATE_HZ, DELAY_US = 50_000.0, 50.0
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """What the person asked for; None leaves it to the source, or to a default where that does not say."""
+    """What the person asked for; None leaves it to the source, or to a default where that does not say.
+
+    ``solves`` semidefinite programs at most are spent on a faster sweep, see `tuning.transition`.
+    """
 
     out: Path
     file: Path | None = None
@@ -44,6 +47,7 @@ class ExportOptions:
     excitation: float | None = None
     delay_us: float | None = None
     made: str | None = None
+    solves: int = 2
 
 
 @dataclass(frozen=True, slots=True)
