@@ -116,7 +116,7 @@ class TextArchive(Archive):
                 self.path,
                 read_options=pacsv.ReadOptions(
                     column_names=list(self.names), skip_rows=self._skip, encoding=self._encoding,
-                    block_size=8 << 20, use_threads=False,
+                    block_size=1 << 20, use_threads=False,
                 ),
                 parse_options=pacsv.ParseOptions(delimiter=self._delimiter, invalid_row_handler=note),
                 convert_options=pacsv.ConvertOptions(
