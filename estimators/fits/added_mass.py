@@ -124,13 +124,17 @@ def fit_added_mass(
     slope, level = np.polyfit(added, 1.0 / (TAU * hz) ** 2, 1)
     if slope <= 0.0 or level + slope * float(added.min()) <= 0.0:
         raise InputError("the resonance does not fall as mass is added; check the columns and their units")
-    first = np.log([1.0 / slope, max(level / slope, -float(added.min()) + 1e-6 * np.ptp(added)) + _shift(added)])
+    first = np.log(
+        [1.0 / slope, max(level / slope, -float(added.min()) + 1e-6 * np.ptp(added)) + _shift(added)]
+    )
 
     def model(log: Array) -> Array:
         stiffness, mass = np.exp(log[0]), np.exp(log[1]) - _shift(added)
         return np.asarray(np.sqrt(stiffness / (mass + added)) / TAU)
 
-    found = least_squares(lambda q: (hz - model(q)) / std, first, x_scale=[0.01, 0.01], ftol=1e-14, xtol=1e-14)
+    found = least_squares(
+        lambda q: (hz - model(q)) / std, first, x_scale=[0.01, 0.01], ftol=1e-14, xtol=1e-14
+    )
     stiffness, mass = float(np.exp(found.x[0])), float(np.exp(found.x[1]) - _shift(added))
     at = model(found.x)
     jacobian = np.column_stack([at / (2.0 * stiffness), -at / (2.0 * (mass + added))]) / std[:, None]

@@ -131,11 +131,15 @@ def smooth_motion(force: Array, displacement: Array, sample_rate_hz: float, name
     spectrum = np.abs(np.fft.rfft(x * np.hanning(len(x)))) ** 2
     hz = np.fft.rfftfreq(len(x), 1.0 / sample_rate_hz)
     power = np.maximum(spectrum - 3.0 * np.median(spectrum[len(spectrum) // 2 :]), 0.0) * hz**2
-    top_hz = float(hz[np.searchsorted(np.cumsum(power), 0.98 * np.sum(power))]) if np.sum(power) > 0.0 else hz[-1]
+    top_hz = (
+        float(hz[np.searchsorted(np.cumsum(power), 0.98 * np.sum(power))]) if np.sum(power) > 0.0 else hz[-1]
+    )
     sigma = float(np.clip(sample_rate_hz / (2.0 * np.pi * 2.0 * max(top_hz, 1e-12)), 0.8, len(x) / 40.0))
     cut = slice(int(4.0 * sigma) + 1, len(x) - int(4.0 * sigma) - 1)
     smooth = [gaussian_filter1d(displacement, sigma, order=o) * sample_rate_hz**o for o in range(3)]
-    return DamperRecord(name, gaussian_filter1d(force, sigma)[cut], smooth[0][cut], smooth[1][cut], smooth[2][cut])
+    return DamperRecord(
+        name, gaussian_filter1d(force, sigma)[cut], smooth[0][cut], smooth[1][cut], smooth[2][cut]
+    )
 
 
 def fit_damper(records: Sequence[DamperRecord], sample_rate_hz: float) -> DamperFit:
@@ -265,7 +269,10 @@ def _energy_per_cycle(r: DamperRecord) -> Estimate | None:
 
 def _explained(r: DamperRecord, residual: Array) -> float:
     """Root mean square of the part of the residual that the motion predicts, judged on samples not fitted."""
-    x, v = (s / np.sqrt(np.mean((s - np.mean(s)) ** 2)) for s in (r.displacement - np.mean(r.displacement), r.velocity))
+    x, v = (
+        s / np.sqrt(np.mean((s - np.mean(s)) ** 2))
+        for s in (r.displacement - np.mean(r.displacement), r.velocity)
+    )
     steep = [np.tanh(v / w) for w in (0.02, 0.1, 0.3)]
     terms = [*steep, v, x, v * np.abs(v), v**3, x**2, x**3, v**2, v * x, x**2 * v, np.abs(v), np.ones_like(v)]
     terms += [x * s for s in steep] + [np.tanh((v + shift * x) / 0.15) for shift in (-0.3, 0.3)]
@@ -333,12 +340,16 @@ def _not_identifiable(
     records: Sequence[DamperRecord], fits: Sequence[RecordFit], c: Estimate, k: Estimate, m: Estimate | None
 ) -> dict[str, str]:
     out = {}
-    named = {"c": (c, "velocity"), "k": (k, "displacement")} | ({"m": (m, "acceleration")} if m is not None else {})
+    named = {"c": (c, "velocity"), "k": (k, "displacement")} | (
+        {"m": (m, "acceleration")} if m is not None else {}
+    )
     for name, (estimate, series) in named.items():
         if estimate is None:
             continue
         share = max(
-            abs(estimate.value) * float(np.std(getattr(r, series))) / max(float(np.sqrt(np.mean(f.residual**2))), 1e-300)
+            abs(estimate.value)
+            * float(np.std(getattr(r, series)))
+            / max(float(np.sqrt(np.mean(f.residual**2))), 1e-300)
             for r, f in zip(records, fits, strict=True)
         )
         if abs(estimate.value) < 3.0 * estimate.std:

@@ -209,7 +209,12 @@ def _heavy(y: Array, rate_hz: float, frequency_hz: float) -> tuple[list[Decay], 
             if best is None or fit.residual_rms < best.residual_rms:
                 best = fit
     mode = best.modes[0] if best is not None else None
-    if best is None or mode is None or best.residual_rms > 0.2 * np.std(y[top:end]) or not 0.02 < mode.damping_ratio < 0.95:
+    if (
+        best is None
+        or mode is None
+        or best.residual_rms > 0.2 * np.std(y[top:end])
+        or not 0.02 < mode.damping_ratio < 0.95
+    ):
         raise InputError(_NONE)
     decay = Decay(top, end, (float(best.amplitude[0, 0]), max(noise, 1e-3 * size)))
     start = (mode.frequency_hz, mode.damping_ratio)
@@ -246,7 +251,9 @@ def _all_modes(
             break
         fit = tried
     if n_modes is not None and len(fit.modes) < n_modes:
-        raise InputError(f"only {len(fit.modes)} modes can be told from noise, {n_modes} were asked for; ask for fewer")
+        raise InputError(
+            f"only {len(fit.modes)} modes can be told from noise, {n_modes} were asked for; ask for fewer"
+        )
     return fit
 
 
@@ -263,7 +270,9 @@ def _next_line(pieces: list[Array], fit: RingingFit, rate_hz: float) -> tuple[fl
         total += power
     allowed = (hz > 3.0 * rate_hz / n) & (hz < 0.48 * rate_hz)
     for m in fit.modes:
-        allowed &= np.abs(hz - m.frequency_hz) > max(NEAR * m.frequency_hz, 4.0 * m.damping_ratio * m.frequency_hz)
+        allowed &= np.abs(hz - m.frequency_hz) > max(
+            NEAR * m.frequency_hz, 4.0 * m.damping_ratio * m.frequency_hz
+        )
     if not allowed.any() or np.max(total[allowed]) < 20.0 * np.median(total[1:]):
         return None
     at = float(hz[allowed][np.argmax(total[allowed])])
@@ -319,7 +328,9 @@ def _band(
     mode = _with_scatter(fit, pieces, rate_hz)
     if not mode.damping_std < 0.5 or mode.damping_std > max(2.0 * abs(mode.damping_ratio), 0.002):
         return None
-    return AmplitudeBand(low, high, mode, len(pieces), sum(len(p) for p in pieces) * mode.frequency_hz / rate_hz)
+    return AmplitudeBand(
+        low, high, mode, len(pieces), sum(len(p) for p in pieces) * mode.frequency_hz / rate_hz
+    )
 
 
 def _with_scatter(fit: RingingFit, pieces: list[Array], rate_hz: float) -> Mode:
@@ -335,7 +346,9 @@ def _with_scatter(fit: RingingFit, pieces: list[Array], rate_hz: float) -> Mode:
         square = float(np.sum(weight * (x - np.sum(weight * x) / np.sum(weight)) ** 2))
         degrees = len(x) - 1
         out.append(np.sqrt(square / degrees) if chi2.sf(square, degrees) < 0.01 else 1.0)
-    return Mode(mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1])
+    return Mode(
+        mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1]
+    )
 
 
 def _differ(bands: list[AmplitudeBand]) -> bool:

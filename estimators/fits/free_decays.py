@@ -137,7 +137,9 @@ def find_decays(values: Array, sample_rate_hz: float, frequency_hz: float) -> li
             smallest = min(smallest, amplitude[last])
         # What precedes a release is smaller than what follows it; a swell in a vibration that goes on is none.
         ahead = amplitude[max(0, top - 40) : top]
-        released = top == 0 or seen.centre[top] < 1.2 * width or (len(ahead) and ahead.min() < 0.5 * amplitude[top])
+        released = (
+            top == 0 or seen.centre[top] < 1.2 * width or (len(ahead) and ahead.min() < 0.5 * amplitude[top])
+        )
         before = top
         while before > 0 and free[before - 1] and amplitude[before - 1] > 0.3 * amplitude[top]:
             before -= 1

@@ -102,11 +102,17 @@ def fit_frf(
         raise InputError("the responses are zero everywhere; there is nothing to fit")
     diagram, candidates = _candidates(f, h)
     clusters = _apart(
-        [c for rows, pairs in neighbourhoods(f, candidates) if (c := fit_cluster(f, h, rows, pairs, cut)) is not None],
+        [
+            c
+            for rows, pairs in neighbourhoods(f, candidates)
+            if (c := fit_cluster(f, h, rows, pairs, cut)) is not None
+        ],
         float(np.median(np.diff(f))),
     )
     if not clusters:
-        raise InputError("no resonance can be told from the noise; choose a band with one, or give better data")
+        raise InputError(
+            "no resonance can be told from the noise; choose a band with one, or give better data"
+        )
     pairs = np.concatenate([c.pairs for c in clusters])
     std = np.concatenate([c.std for c in clusters])
     residues = np.concatenate([c.residues for c in clusters], axis=1)
@@ -120,9 +126,7 @@ def fit_frf(
         chosen = np.zeros(len(strength), dtype=bool)
         chosen[np.argsort(strength)[::-1][:n_modes]] = True
     order = np.argsort(pairs[:, 0])
-    modes = [
-        (Mode(*map(float, (*pairs[i], *std[i]))), bool(chosen[i])) for i in order
-    ]
+    modes = [(Mode(*map(float, (*pairs[i], *std[i]))), bool(chosen[i])) for i in order]
     model, noise = np.full(h.shape, np.nan, dtype=np.complex128), np.full(h.shape, np.nan)
     for c in clusters:
         model[c.rows], noise[c.rows] = c.model(f, cut), np.sqrt(c.variance)
@@ -149,7 +153,10 @@ def _candidates(f: Array, h: ComplexArray) -> tuple[Stabilisation, Array]:
     out: list[tuple[float, float]] = []
     for p in (*sorted(flat.poles, key=lambda p: abs(p.damping_ratio)), *even.poles):
         # A broad pole may lie over a sharp one, but not a sharp one over itself.
-        near = [abs(p.frequency_hz - a) <= max(1.5 * min(z * a, p.damping_ratio * p.frequency_hz), spacing) for a, z in out]
+        near = [
+            abs(p.frequency_hz - a) <= max(1.5 * min(z * a, p.damping_ratio * p.frequency_hz), spacing)
+            for a, z in out
+        ]
         if p.found > STEADY and not any(near):
             out.append((p.frequency_hz, p.damping_ratio))
     # A broad pole with a sharp one inside fits what the sharp one leaves; the remainder is there for that.
@@ -187,6 +194,8 @@ def _preferred(f: Array, h: ComplexArray, clusters: list[Cluster], window: Windo
     for kind in ("none", "rectangular", "hann"):
         if kind not in costs:
             other = Window(kind, 1.0 / spacing)
-            costs[kind] = sum(fit_once(f[c.rows], h[c.rows], c.found.theta, c.variance, other).cost for c in sharp)
+            costs[kind] = sum(
+                fit_once(f[c.rows], h[c.rows], c.found.theta, c.variance, other).cost for c in sharp
+            )
     best = min(costs, key=lambda k: costs[k])
     return best if costs[best] < 0.7 * costs[window.kind] else None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from estimators.fits.modal_model import REMAINDERS, Window, modal_basis, mode_columns
 from estimators.fits.response_noise import noise_variance
@@ -175,7 +175,9 @@ def _learn_noise(f: Array, found: SeparableFit, variance: Array, window: Window)
         q = np.linalg.qr(found.bases[k])[0]
         leverage = np.sum(q**2, axis=1) + np.einsum("ij,jk,ik->i", j, shared, j)
         kept = 1.0 - 0.5 * (leverage[:n] + leverage[n:])
-        out[:, k] = noise_variance(np.abs(_complex(r)) ** 2 * scale**2, kept, np.abs(_complex(basis @ c)) ** 2)
+        out[:, k] = noise_variance(
+            np.abs(_complex(r)) ** 2 * scale**2, kept, np.abs(_complex(basis @ c)) ** 2
+        )
     return out
 
 

@@ -55,7 +55,9 @@ class Stabilisation:
     poles: tuple[Pole, ...]
 
 
-def poles_by_order(frequency_hz: Array, response: ComplexArray, weight: Array, orders: Sequence[int]) -> list[ComplexArray]:
+def poles_by_order(
+    frequency_hz: Array, response: ComplexArray, weight: Array, orders: Sequence[int]
+) -> list[ComplexArray]:
     """Stable poles [1/s] inside the band for each order, all responses together.
 
     Parameters
@@ -98,7 +100,9 @@ def poles_by_order(frequency_hz: Array, response: ComplexArray, weight: Array, o
     return out
 
 
-def stabilise(frequency_hz: Array, response: ComplexArray, weight: Array, largest_order: int) -> Stabilisation:
+def stabilise(
+    frequency_hz: Array, response: ComplexArray, weight: Array, largest_order: int
+) -> Stabilisation:
     """Stabilisation diagram and the poles that stay."""
     orders = list(range(2, largest_order + 1))
     rows: list[tuple[int, float, float, bool]] = []

@@ -75,7 +75,9 @@ def modal_basis(frequency_hz: Array, theta: Array, window: Window) -> Array:
     return np.concatenate([matrix.real, matrix.imag])
 
 
-def mode_columns(s: ComplexArray, frequency_hz: float, damping_ratio: float, window: Window) -> list[ComplexArray]:
+def mode_columns(
+    s: ComplexArray, frequency_hz: float, damping_ratio: float, window: Window
+) -> list[ComplexArray]:
     """(n,) responses to a mode's residue of 1 and of j, at ``s = jw``."""
     pole = TAU * frequency_hz * (-damping_ratio + 1j * np.sqrt(max(1.0 - damping_ratio**2, 0.0)))
     here, mirrored = window.kernel(s - pole), window.kernel(s - np.conj(pole))

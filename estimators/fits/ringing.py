@@ -58,7 +58,11 @@ def damped_pair(time_s: Array, frequency_hz: float, damping_ratio: float) -> tup
 
 
 def fit_ringing(
-    segments: Sequence[Array], sample_rate_hz: float, start: Sequence[tuple[float, float]], *, drift_order: int = 1
+    segments: Sequence[Array],
+    sample_rate_hz: float,
+    start: Sequence[tuple[float, float]],
+    *,
+    drift_order: int = 1,
 ) -> RingingFit:
     """Fit damped sinusoids with common frequencies and damping ratios to segments of free vibration.
 
@@ -100,9 +104,7 @@ def fit_ringing(
         [float(np.hypot(*c[drift_order + 1 + 2 * m : drift_order + 3 + 2 * m])) for m in range(len(modes))]
         for c in found.coefficients
     ])  # fmt: skip
-    drift = tuple(
-        trend @ c[: drift_order + 1] for trend, c in zip(trends, found.coefficients, strict=True)
-    )
+    drift = tuple(trend @ c[: drift_order + 1] for trend, c in zip(trends, found.coefficients, strict=True))
     model = tuple(s - r for s, r in zip(segments, found.residuals, strict=True))
     return RingingFit(modes, covariance, model, drift, amplitude, float(np.sqrt(found.cost / found.freedom)))
 

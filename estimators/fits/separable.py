@@ -95,7 +95,9 @@ def fit_separable(
     """
     problem = _Problem(bases, data, np.asarray(steps, dtype=np.float64), slopes)
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    first = np.clip(np.asarray(start, dtype=np.float64), low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+    first = np.clip(
+        np.asarray(start, dtype=np.float64), low + 1e-9 * (high - low), high - 1e-9 * (high - low)
+    )
     found = least_squares(
         lambda theta: np.concatenate(problem.at(theta).residuals),
         first,
@@ -121,7 +123,9 @@ def fit_separable(
 def invert(information: Array) -> Array:
     """Inverse of a symmetric non-negative matrix, scaled first; the pseudo-inverse where it is singular."""
     scale = np.sqrt(np.maximum(np.diag(information), np.finfo(np.float64).tiny))
-    return np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale))
+    return np.asarray(
+        np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    )
 
 
 def _project(matrix: Array, y: Array) -> tuple[Array, Array]:

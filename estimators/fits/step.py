@@ -111,12 +111,16 @@ def fit_steps(pieces: Sequence[StepPiece], sample_rate_hz: float) -> StepFit:
         forced = _forced(pieces, sample_rate_hz, start, forced.theta)
     if method == "free" and free is not None:
         mode, model = free.modes[0], _placed(free.model, pieces)
-        singles = [fit_ringing([p.output[_settled(p) :]], sample_rate_hz, [_pair(mode)]).modes[0] for p in pieces]
+        singles = [
+            fit_ringing([p.output[_settled(p) :]], sample_rate_hz, [_pair(mode)]).modes[0] for p in pieces
+        ]
         residual = free.residual_rms
         delay = rise = None
     else:
         covariance = spectral_covariance(forced)
-        mode = Mode(float(forced.theta[0]), float(forced.theta[1]), *map(float, np.sqrt(np.diag(covariance)[:2])))
+        mode = Mode(
+            float(forced.theta[0]), float(forced.theta[1]), *map(float, np.sqrt(np.diag(covariance)[:2]))
+        )
         model = tuple(p.output - r for p, r in zip(pieces, forced.residuals, strict=True))
         residual = float(np.sqrt(forced.cost / forced.freedom))
         singles = []
@@ -127,7 +131,9 @@ def fit_steps(pieces: Sequence[StepPiece], sample_rate_hz: float) -> StepFit:
         delay = float(forced.theta[2])
         rise = float(forced.theta[3]) if len(forced.theta) > 3 else None
     if not residual < 0.5 * _rms([p.output - np.mean(p.output) for p in pieces]):
-        raise InputError("the response after the step is not that of a second-order system; check the channels")
+        raise InputError(
+            "the response after the step is not that of a second-order system; check the channels"
+        )
     zeta = mode.damping_ratio
     overshoot = float(np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2))) if abs(zeta) < 1.0 else 0.0
     return StepFit(
@@ -152,7 +158,9 @@ def second_order(drive: Array, sample_rate_hz: float, frequency_hz: float, dampi
     a = np.array([[c0 + z * w * s0, s0], [-w * w * s0, c0 - z * w * s0]])
     one = np.array([1.0 - a[0, 0], -a[1, 0]])
     # A unit ramp's particular solution is t - 2 z/w.
-    ramp = np.array([dt - 2.0 * z / w + a[0, 0] * 2.0 * z / w - a[0, 1], 1.0 + a[1, 0] * 2.0 * z / w - a[1, 1]])
+    ramp = np.array(
+        [dt - 2.0 * z / w + a[0, 0] * 2.0 * z / w - a[0, 1], 1.0 + a[1, 0] * 2.0 * z / w - a[1, 1]]
+    )
     b1 = ramp / dt
     b0 = one - b1
     # As a recursion of second order in y alone, from the characteristic polynomial of the transition.
@@ -177,7 +185,12 @@ def _forced(
     theta, steps = [start[0], start[1], 0.0], [0.02 * start[0], 0.02, 0.02 / start[0]]
     if not measured:
         # An ideal step has a rise as well, at least what fits between two samples.
-        low.append(0.0), high.append(1.5 / start[0]), theta.append(1.0 / rate_hz), steps.append(0.02 / start[0])
+        (
+            low.append(0.0),
+            high.append(1.5 / start[0]),
+            theta.append(1.0 / rate_hz),
+            steps.append(0.02 / start[0]),
+        )
 
     def bases(now: Array) -> list[Array]:
         out = []
@@ -251,8 +264,16 @@ def _first_guess(pieces: Sequence[StepPiece], rate_hz: float) -> tuple[float, fl
         crossings = np.flatnonzero(sign[1:] * sign[:-1] < 0)
         if len(crossings) >= 3:
             frequencies.append(0.5 * rate_hz * (len(crossings) - 1) / (crossings[-1] - crossings[0]))
-            swings = [np.max(np.abs(error[a:b + 1])) for a, b in zip(crossings[:-1], crossings[1:], strict=True) if b > a]
-            drop = -np.polyfit(np.arange(len(swings)), np.log(np.maximum(swings, 1e-12)), 1)[0] if len(swings) > 1 else 0.5
+            swings = [
+                np.max(np.abs(error[a : b + 1]))
+                for a, b in zip(crossings[:-1], crossings[1:], strict=True)
+                if b > a
+            ]
+            drop = (
+                -np.polyfit(np.arange(len(swings)), np.log(np.maximum(swings, 1e-12)), 1)[0]
+                if len(swings) > 1
+                else 0.5
+            )
             dampings.append(float(np.clip(drop / np.hypot(np.pi, drop), 1e-3, 0.7)))
         else:
             # Hardly any overshoot: the time to reach two thirds of the step.
@@ -273,12 +294,15 @@ def _with_scatter(mode: Mode, singles: Sequence[Mode]) -> Mode:
         square = float(np.sum(weight * (x - np.sum(weight * x) / np.sum(weight)) ** 2))
         degrees = len(x) - 1
         out.append(np.sqrt(square / degrees) if chi2.sf(square, degrees) < 0.01 else 1.0)
-    return Mode(mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1])
+    return Mode(
+        mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1]
+    )
 
 
 def _placed(tails: Sequence[Array], pieces: Sequence[StepPiece]) -> tuple[Array, ...]:
     return tuple(
-        np.concatenate([np.full(len(p.output) - len(t), np.nan), t]) for t, p in zip(tails, pieces, strict=True)
+        np.concatenate([np.full(len(p.output) - len(t), np.nan), t])
+        for t, p in zip(tails, pieces, strict=True)
     )
 
 

@@ -15,7 +15,9 @@ def squareness(values: Array) -> float:
         return 0.0
     level = (values - low) / (high - low)
     two = (np.abs(level) < 0.12) | (np.abs(level - 1.0) < 0.12)
-    return float(np.mean(two)) * float(min(1.0, 8.0 * np.mean(np.abs(level) < 0.2), 8.0 * np.mean(np.abs(level - 1.0) < 0.2)))
+    return float(np.mean(two)) * float(
+        min(1.0, 8.0 * np.mean(np.abs(level) < 0.2), 8.0 * np.mean(np.abs(level - 1.0) < 0.2))
+    )
 
 
 def edges(values: Array) -> list[int]:
@@ -26,7 +28,7 @@ def edges(values: Array) -> list[int]:
     level = (values - low) / (high - low)
     out, state = [], bool(np.median(level[: max(3, len(level) // 200)]) > 0.5)
     for k, x in enumerate(level):
-        if x > 0.7 and not state or x < 0.3 and state:
+        if (x > 0.7 and not state) or (x < 0.3 and state):
             state = not state
             out.append(k)
     # Back from the crossing to where the edge began.
@@ -63,7 +65,11 @@ def find_steps(output: Array, drive: Array | None, record: int = 0) -> list[Step
         end = at[k + 1] if k + 1 < len(at) else len(output)
         begin = max(edge - max(8, (end - edge) // 10), 0 if k == 0 else at[k - 1])
         if end - edge >= FEWEST:
-            out.append(StepPiece(output[begin:end], None if drive is None else drive[begin:end], edge - begin, record))
+            out.append(
+                StepPiece(
+                    output[begin:end], None if drive is None else drive[begin:end], edge - begin, record
+                )
+            )
     # The last step may be cut off by the end of the record: without its settled level it says little.
     longest = max((len(p.output) - p.edge for p in out), default=0)
     return [p for p in out if len(p.output) - p.edge > 0.5 * longest]
@@ -81,7 +87,11 @@ def _jumps(output: Array) -> list[int]:
         before = output[max(0, k - span) : k] if k else output[:1]
         level, quiet = float(np.median(before)), float(np.ptp(before))
         ahead = output[k : k + max(3, span // 4)]
-        if abs(float(ahead[0]) - level) > max(6.0 * noise, 0.04 * size) and quiet < 0.25 * size and k - (out[-1] if out else -n) > span:
+        if (
+            abs(float(ahead[0]) - level) > max(6.0 * noise, 0.04 * size)
+            and quiet < 0.25 * size
+            and k - (out[-1] if out else -n) > span
+        ):
             start = k
             while start > 0 and abs(float(output[start - 1]) - level) > max(3.0 * noise, 0.005 * size):
                 start -= 1

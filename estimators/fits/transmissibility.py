@@ -78,7 +78,9 @@ def fit_transmissibility(frequency_hz: ArrayLike, ratio: ArrayLike) -> Transmiss
     size = np.abs(data)
     peak = int(np.argmax(size))
     start_f = float(f[peak])
-    start_z = float(np.clip(1.0 / (2.0 * max(size[peak] / max(float(size[np.argmin(f)]), 1e-12), 1.05)), 2e-5, 0.6))
+    start_z = float(
+        np.clip(1.0 / (2.0 * max(size[peak] / max(float(size[np.argmin(f)]), 1e-12), 1.05)), 2e-5, 0.6)
+    )
     variance = (0.1 * size) ** 2 + (0.02 * float(np.sqrt(np.mean(size**2)))) ** 2
     guesses = ((start_f, start_z), (1.1 * start_f, 0.3))
     found = min((_fit(f, data, guess, variance) for guess in guesses), key=lambda fit: fit.cost)
@@ -89,7 +91,9 @@ def fit_transmissibility(frequency_hz: ArrayLike, ratio: ArrayLike) -> Transmiss
     std = np.sqrt(np.diag(found.covariance(max(1.0, misfit))))
     gain = float(found.coefficients[0][0])
     model = gain * transmissibility(f, float(found.theta[0]), float(found.theta[1]))
-    left = float(np.sqrt(np.mean(np.abs((data if np.iscomplexobj(data) else data + 0j) - _like(model, data)) ** 2)))
+    left = float(
+        np.sqrt(np.mean(np.abs((data if np.iscomplexobj(data) else data + 0j) - _like(model, data)) ** 2))
+    )
     if left > 0.7 * float(np.std(data)):
         raise InputError("the data do not look like a transmissibility with one resonance; choose its band")
     basis = found.bases[0][:, 0]
