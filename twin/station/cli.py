@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from twin.plant.errors import InputError, RunError
+from twin.station.fit import fit_app
 from twin.station.library import recordings_app
 from twin.station.terminal import (
     JsonOption,
@@ -36,6 +37,7 @@ app = typer.Typer(
 )
 
 app.add_typer(recordings_app)
+app.add_typer(fit_app, name="fit")
 
 
 class ControllerName(StrEnum):
@@ -535,6 +537,84 @@ def whatif(
     must_be_writable(json_to)
     options = WhatIfOptions(file, plant, tuple(settings or ()), band, at, branch_s, delay_us, plot)
     report(run_whatif(options, say), whatif_table, json_to)
+
+
+class BudgetName(StrEnum):
+    """Which power a budget bounds."""
+
+    JOULE_MEAN = "joule_mean"
+    JOULE_PEAK = "joule_peak"
+    ELECTRICAL = "electrical"
+
+
+@app.command(
+    epilog="Examples: atmd tune --plant engine_vcm --budget-w 25   ·   "
+    "atmd tune --plant rig --band 45:55:1 --modulus-margin 0.15 --plot tune.png"
+)
+def tune(
+    plant: Annotated[
+        str, typer.Option(metavar="PRESET|FILE", help="Plant with a voice coil.", show_default=False)
+    ],
+    band: Annotated[
+        str, typer.Option(metavar="FROM:TO:STEP|LIST", help="Excitation frequencies in Hz.")
+    ] = "47:53:0.5",
+    budget_w: Annotated[float, typer.Option(metavar="W", help="Power the coil may take, in W.")] = 25.0,
+    budget: Annotated[
+        BudgetName, typer.Option(help="Which: R i_rms², R i_peak², or the mean of v i.")
+    ] = BudgetName.JOULE_MEAN,
+    excitation_n: Annotated[
+        float | None, typer.Option(metavar="N", help="Peak of an exciting force, in N; 1000 unless given.")
+    ] = None,
+    excitation_v: Annotated[
+        float | None, typer.Option(metavar="V", help="Peak at an exciting shaker, in V; 4 unless given.")
+    ] = None,
+    delay_us: Annotated[
+        float, typer.Option(metavar="US", help="Delay from measuring to the converter, in µs; its hold comes on top.")
+    ] = 50.0,
+    modulus_margin: Annotated[float, typer.Option(metavar="M", help="Least |1 + L|.")] = 0.3,
+    delay_margin_us: Annotated[
+        float, typer.Option(metavar="US", help="Further delay the loop must stand, in µs.")
+    ] = 200.0,
+    sample_rate: Annotated[float, typer.Option(metavar="HZ", help="Of the controller, in Hz.")] = 50_000.0,
+    displacement_um: Annotated[
+        float | None,
+        typer.Option(metavar="UM", help="Motion that is enough, in µm: reached with the least power."),
+    ] = None,
+    damping_std: Annotated[
+        float, typer.Option(metavar="NS_M", help="Standard deviation of the absorber's damping, in Ns/m.")
+    ] = 0.1,
+    drift: Annotated[
+        float, typer.Option(metavar="HZ", help="How far the excitation may be off within the budget, in Hz.")
+    ] = 0.25,
+    cutoffs: Annotated[
+        str | None,
+        typer.Option(metavar="LP,HP", help="Filter cutoffs in Hz; those of Test 3 or better unless given."),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw motion, power and margins.")] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Work out gains for each frequency: as quiet as the power allows, verified, beside what physics allows.
+
+    Every point holds its budget and limits with the excitation off by --drift and the damping by two standard
+    deviations. Frequencies without gains say which limit binds and the least budget that would do. JSON keys of each of
+    points: frequency_hz, limit_displacement_m (least of any linear controller), achieved_displacement_m,
+    passive_displacement_m, displacement_range_m and power_range_w (damping two deviations off), joule_mean_w,
+    joule_peak_w, electrical_mean_w, stroke_m, current_peak_a, voltage_peak_v, lq (states, Q, R, K of the power-budgeted
+    LQ), duality_gap, gains, cutoffs, modulus_margin, delay_margin_s (8 ms where none below destabilises),
+    decay_rate_1_s, active_limits (name, price, unit), solve_ms; or reason, binding, least_budget_w.
+    """
+    from twin.station.tune import TuneOptions, run_tune, troubles, tune_table
+
+    must_be_writable(json_to)
+    options = TuneOptions(
+        plant, band, budget_w, budget.value, excitation_n, excitation_v, delay_us, modulus_margin, delay_margin_us,
+        sample_rate, displacement_um, damping_std, drift, cutoffs, plot,
+    )  # fmt: skip
+    with progress_bar("tune") as progress:
+        result = run_tune(options, say, progress)
+    report(result, tune_table, json_to)
+    for line in troubles(result):
+        say(line)
 
 
 @app.command(epilog="Example: atmd validate --report runs/validation --json validation.json")
