@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimators.signal_kernels import BINS, LOWEST, mark_missing, mark_runs, mark_spikes, scan, trailing_runs
 from twin.plant.blocks import Block
 from twin.plant.config import Plant
-from twin.plant.linear import Array
+from twin.plant.linear import Array, read_only
 
 FindingKind = Literal["missing", "stuck", "saturated", "spiking"]
 
@@ -139,15 +139,16 @@ class SignalCheck:
         self._know_roughness(values, came)
         bound = SPIKE_SIGMAS * np.fmax(self._std, self._roughness / _ROUGHNESS_OF_NOISE)
         bound[~self._spikes] = math.inf
-        beyond, same, jumps, rough, low, high = scan(
-            values, self._tail[2:], self._range, bound, self._std, self._noisy, self._steps
-        )
+        counts, levels = np.empty((3, len(bound)), dtype=np.int64), np.empty((3, len(bound)))
+        scan(values, self._tail[2:], self._range, bound, self._std, self._noisy, self._steps, counts, levels)
+        (beyond, same, jumps), (rough, low, high) = counts, levels
         runs = self._noisy & (same + self._run_length >= SHORTEST_RUN)
         findings: list[Finding] = []
         valid = came
-        if not bool(came.all()) or bool((beyond + jumps + runs).any()):
+        whole = bool(came.all())
+        if not whole or beyond.any() or jumps.any() or runs.any():
             kinds = np.zeros(values.shape, dtype=np.uint8)
-            if beyond.any() or not came.all():
+            if beyond.any() or not whole:
                 mark_missing(values, came, self._range, kinds)
             for c in np.flatnonzero(self._noisy):
                 if runs[c]:
@@ -167,8 +168,9 @@ class SignalCheck:
                 valid = came & (kinds == 0)
                 valid.flags.writeable = False
                 findings = self._findings(block, kinds)
-        self._remember(np.where(came[-4:], values[-4:], math.nan), values, same, rough, low, high)
-        if not came.all():
+        tail = values[-4:] if whole else np.where(came[-4:], values[-4:], math.nan)
+        self._remember(tail, values, same, rough, low, high)
+        if not whole:
             # What stands in the place of a missing sample is no reading: it starts no run.
             self._run_length[~came.all(axis=0)] = 1
         if not findings:
@@ -180,12 +182,16 @@ class SignalCheck:
 
     def warm_up(self, block: Block) -> None:
         """Compile what a block needs, on copies; to be called before the first block."""
-        values = np.array(block.values)
+        values, valid = read_only(block.values), np.array(block.valid)
+        valid.flags.writeable = False  # as blocks come: a kernel for other arrays would be another kernel
         kinds = np.zeros(values.shape, dtype=np.uint8)
-        scan(values, self._tail[2:], self._range, self._std, self._std, self._noisy, self._steps.copy())
-        mark_missing(values, np.array(block.valid), self._range, kinds)
+        p = values.shape[1]
+        counts, levels = np.empty((3, p), dtype=np.int64), np.empty((3, p))
+        steps = self._steps.copy()
+        scan(values, self._tail[2:], self._range, self._std, self._std, self._noisy, steps, counts, levels)
+        mark_missing(values, valid, self._range, kinds)
         mark_runs(values[:, 0], 10, self._run_length[0], self._tail[3, 0], kinds[:, 0])
-        mark_spikes(values[:, 0], np.array(block.valid)[:, 0], self._tail[:, 0], 1.0, kinds[:, 0])
+        mark_spikes(values[:, 0], valid[:, 0], self._tail[:, 0], 1.0, kinds[:, 0])
         trailing_runs(values, self._run_length, np.zeros(values.shape[1], dtype=np.int64))
 
     def _know_roughness(self, values: Array, came: NDArray[np.bool_]) -> None:

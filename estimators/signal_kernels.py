@@ -25,7 +25,9 @@ def scan(
     std: Array,
     noisy: NDArray[np.bool_],
     steps: Array,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array, Array, Array]:
+    counts: NDArray[np.int64],
+    levels: Array,
+) -> None:
     """Cheap look at a block, which tells whether it deserves a closer one.
 
     Parameters
@@ -42,19 +44,18 @@ def scan(
     std, noisy, steps
         (p,), (p,), (p, bins): standard deviations, whether to count, and the counts of steps by size, updated.
 
-    Returns
-    -------
-    beyond, same, jumps
-        (p,) samples at the end of their range or not finite; equal to the one before; suspicious jumps.
-    rough
-        (p,) mean of clipped |second differences| over some of the rows; NaN where there were none.
-    low, high
-        (p,) extremes among some of the rows.
+    counts
+        (3, p) receives how many samples are at the end of their range or not finite; equal to the one before;
+        suspicious jumps.
+    levels
+        (3, p) receives the mean of clipped |second differences| over some of the rows, NaN where there were none;
+        the lowest and the highest value among them.
     """
     n, p = values.shape
-    beyond, same = np.zeros(p, dtype=np.int64), np.zeros(p, dtype=np.int64)
-    jumps = np.zeros(p, dtype=np.int64)
-    rough, low, high = np.full(p, np.nan), np.full(p, np.inf), np.full(p, -np.inf)
+    beyond, same, jumps = counts[0], counts[1], counts[2]
+    rough, low, high = levels[0], levels[1], levels[2]
+    counts[:] = 0
+    rough[:], low[:], high[:] = np.nan, np.inf, -np.inf
     signals = np.empty((p, STRETCH + 2))
     for c in range(p):
         signals[c, 0], signals[c, 1] = before[0, c], before[1, c]
@@ -92,7 +93,6 @@ def scan(
             counted += 1
         if counted:
             rough[c] = total / counted
-    return beyond, same, jumps, rough, low, high
 
 
 @kernel
