@@ -50,17 +50,54 @@ def steady_prior(F: Array, H: Array, Q: Array, R: Array) -> Array:
         std = np.sqrt(np.diag(X))
         scale = np.where(std > 0.0, std, scale)
     X = 0.5 * (X + X.T)
-    # One step of the recursion itself takes off what rounding left in all that settles fast.
-    refined = riccati_step(F, H, Q, R, X)
-    return np.asarray(0.5 * (refined + refined.T))
+    # Where a measurement tells much more than was known, I + G X loses digits. Newton's method finds them again: the
+    # residual, as it would go on through the filter's own samples.
+    for _ in range(2):
+        change, closed = _residual(F, H, Q, R, X)
+        units = np.outer(scale, scale)
+        change, closed = change / units, np.ascontiguousarray(closed / scale[:, None] * scale)
+        if np.max(np.abs(change)) <= 1e-15 or not sum_of_powers(closed, change):
+            break
+        X = X + 0.5 * (change + change.T) * units
+    return np.asarray(X)
+
+
+def _residual(F: Array, H: Array, Q: Array, R: Array, prior: Array) -> tuple[Array, Array]:
+    """What one sample adds to a covariance before a measurement, and ``F (I - K H)``."""
+    residual = H @ prior @ H.T + R
+    gain = np.linalg.solve(residual, H @ prior).T
+    closed = F @ (np.eye(len(F)) - gain @ H)
+    through = F @ gain
+    return closed @ prior @ closed.T + through @ R @ through.T + Q - prior, closed
 
 
 def riccati_step(F: Array, H: Array, Q: Array, R: Array, prior: Array) -> Array:
     """One sample of the recursion whose steady state `steady_prior` is."""
-    residual = H @ prior @ H.T + R
-    gain = np.linalg.solve(residual, H @ prior).T
-    kept = np.eye(len(F)) - gain @ H
-    return np.asarray(F @ (kept @ prior @ kept.T + gain @ R @ gain.T) @ F.T + Q)
+    return np.asarray(prior + _residual(F, H, Q, R, prior)[0])
+
+
+@kernel
+def sum_of_powers(A: Array, X: Array) -> bool:
+    """``X <- X + A X A' + A² X A'² + ...`` by doubling (Smith 1968), in place; A is used up. Whether it converged."""
+    n = len(A)
+    half, added = np.empty((n, n)), np.empty((n, n))
+    for _ in range(MAX_DOUBLINGS):
+        multiply(A, X, half)
+        multiply_transposed(half, A, added)
+        largest, change = 0.0, 0.0
+        for i in range(n):
+            for j in range(n):
+                X[i, j] += added[i, j]
+                change, largest = max(change, abs(added[i, j])), max(largest, abs(X[i, j]))
+        if not largest < np.inf:
+            return False
+        if change <= 1e-16 * largest:
+            return True
+        multiply(A, A, half)
+        for i in range(n):
+            for j in range(n):
+                A[i, j] = half[i, j]
+    return False
 
 
 @kernel
