@@ -6,6 +6,7 @@ a delay of any length. Stability is judged by the closed loop's eigenvalues, nev
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import control
 import numpy as np
@@ -280,7 +281,7 @@ class RigModel:
             (count,) real parts, the largest first, one of each pair; (count, 3) their slopes over alpha, beta, gamma.
         """
         n, fs, k = len(self._late), self.facts.sample_rate_hz, self.coil.force_constant_n_a
-        found: tuple[ComplexArray, ...] = eig(self.closed_loop_matrix(gains), left=True, right=True)
+        found: Any = eig(self.closed_loop_matrix(gains), left=True, right=True)
         poles, left, right = found[0], found[1], found[2]
         overlap = np.einsum("ij,ij->j", left.conj(), right)
         # A pole on top of another has no slope of its own.

@@ -212,6 +212,15 @@ class Retuner:
             refusals=tuple(refusals),
         )
 
+    @property
+    def limits(self) -> CoilLimits:
+        """What the coil must keep: the plant's limits and the budget."""
+        return self._limits
+
+    def passive_m(self, plant: Plant, frequency_hz: float, amplitude: float) -> float:
+        """Motion of the primary without control [m]."""
+        return abs(Situation(plant, self.facts, frequency_hz, amplitude, 0.0, 0.0).paths.motion[1])
+
     def limit_at(self, plant: Plant, frequency_hz: float, amplitude: float) -> LimitResult:
         """Physical limit at one frequency.
 

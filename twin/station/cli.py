@@ -539,14 +539,6 @@ def whatif(
     report(run_whatif(options, say), whatif_table, json_to)
 
 
-class BudgetName(StrEnum):
-    """Which power a budget bounds."""
-
-    JOULE_MEAN = "joule_mean"
-    JOULE_PEAK = "joule_peak"
-    ELECTRICAL = "electrical"
-
-
 @app.command(
     epilog="Examples: atmd tune --plant engine_vcm --budget-w 25   ·   "
     "atmd tune --plant rig --band 45:55:1 --modulus-margin 0.15 --plot tune.png"
