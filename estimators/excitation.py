@@ -31,6 +31,9 @@ MAX_FITS = 8
 POOR_FIT = 0.02
 """Residual power over the tone's: with more the tracker looks whether it follows the wrong tone."""
 
+NO_NOISE = 1e-6
+"""Residual power over the tone's that is too little to tell a jump from."""
+
 RATE_WALK_HZ_S = 0.5
 """Random walk of the sweep rate [Hz/s per sqrt(s)]; faster changes are taken for a break of its course."""
 
@@ -83,6 +86,8 @@ class ExcitationTracker:
         self._band = band_hz
         self._course: _Course | None = None
         self._next_sample: int | None = None
+        self._residual: float | None = None
+        self._power = 0.0
         self._colour = _RunningColour(len(self.channels))
 
     def advance(self, block: Block) -> Phasors | None:
@@ -106,7 +111,7 @@ class ExcitationTracker:
             strongest = self._search(samples, band)
             if strongest is None:
                 return None
-            self._course = _Course(strongest)
+            self._course, self._residual = _Course(strongest), None
             samples = averaged(values, dt, strongest, None if rows.all() else rows)
         course = self._course
         half = 0.5 * n * dt
@@ -120,6 +125,7 @@ class ExcitationTracker:
                 if better.residual_variance[self._column] < fit.residual_variance[self._column]:
                     fit, f_mid = better, hz
         size = abs(complex(fit.amplitude[self._column]))
+        self._power = 0.5 * size**2
         if not band[0] <= f_mid <= band[1] or size**2 <= LOST_SIGNAL_RATIO**2 * fit.variance[self._column]:
             self._course = None
             return None
@@ -127,7 +133,8 @@ class ExcitationTracker:
         variance, slope_variance = fit.variance * noise, fit.slope_variance * noise
         sample_variance = fit.residual_variance * noise
         f_std = math.sqrt(0.5 * slope_variance[self._column]) / (math.tau * size)
-        steady = course.correct(f_mid, f_std) and not searched
+        one_tone = self._looks_as_before(float(fit.residual_variance[self._column]))
+        steady = course.correct(f_mid, f_std, one_tone) and not searched
         course.go_on(half)
         dead = ~live
         if dead.any():
@@ -185,6 +192,16 @@ class ExcitationTracker:
             f_mid = max(f_mid + correction, 1e-3)
         return fit, f_mid
 
+    def _looks_as_before(self, residual: float) -> bool:
+        """Whether the reference's residual is no stronger than it was in the blocks before."""
+        before = self._residual
+        if before is None:
+            self._residual = residual
+            return True
+        self._residual = 0.9 * before + 0.1 * min(residual, SUDDEN_NOISE * before)
+        # Without any noise rounding alone is left, and any share of it may come and go.
+        return residual <= SUDDEN_NOISE * before or residual < NO_NOISE * self._power
+
     def _search(self, samples: Samples, band: tuple[float, float]) -> float | None:
         strongest = strongest_hz(samples, self._column, (self._band[0], band[1]))
         return strongest if strongest >= band[0] else None
@@ -226,12 +243,15 @@ class _Course:
         walk = RATE_WALK_HZ_S**2 * np.array([[d**3 / 3.0, 0.5 * d**2], [0.5 * d**2, d]])
         self._variance = step @ self._variance @ step.T + walk
 
-    def correct(self, frequency_hz: float, std_hz: float) -> bool:
-        """Take a block's frequency in; returns whether it lies on the course so far."""
+    def correct(self, frequency_hz: float, std_hz: float, one_tone: bool) -> bool:
+        """Take a block's frequency in; returns whether it lies on the course so far.
+
+        A block that does not hold one tone throughout has left it, wherever its frequency lies.
+        """
         P = self._variance
         s = P[0, 0] + std_hz**2 + 1e-14
         innovation = frequency_hz - self.frequency
-        if abs(innovation) > BREAK_SIGMAS * math.sqrt(s):
+        if not one_tone or abs(innovation) > BREAK_SIGMAS * math.sqrt(s):
             self.frequency, self.rate = frequency_hz, 0.0
             self._variance = np.diag([max(std_hz, 0.1) ** 2, NEW_RATE_STD_HZ_S**2])
             self._new = False
