@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from tuning.firmware import BITS, fixed_table, point_figures, rounding_effect
 from tuning.loop import LoopFacts, RigModel
-from tuning.retune import predict
 from tuning.rule import scheduling_rule
+from tuning.steady import predict
 from twin.control.chain import chain_step
 from twin.control.schedule import Acknowledgement, Command, Gains, GainSchedule
 from twin.plant.blocks import make_block
@@ -406,12 +406,17 @@ def tuned(**changes: Any) -> dict[str, Any]:
 
 def test_tuning_becomes_a_table_that_acts_between_its_ends(tmp_path: Path) -> None:
     file = tmp_path / "tuning.json"
-    file.write_text(json.dumps(tuned(budget_w=4.0, budget_kind="joule_peak")))
-    result = run_export(ExportOptions(out=tmp_path, file=file, plant="rig", delay_us=20.0), quiet)
+    file.write_text(
+        json.dumps(
+            tuned(plant="rig", budget_w=4.0, budget_kind="joule_peak", excitation=3.0, loop_delay_s=2e-5)
+        )
+    )
+    result = run_export(ExportOptions(out=tmp_path, file=file), quiet)
     found = read_export(tmp_path / "rig_schedule.json", RIG)
     expected = scheduling_rule(RIG, (49.0, 50.0, 51.0))
     assert found.schedule == expected
     assert found.loop.facts == FACTS
+    assert found.excitation.amplitude == 3.0
     assert found.budget is not None
     assert (found.budget.power_w, found.budget.kind) == (4.0, "joule_peak")
     assert [p["frequency_hz"] for p in result["points"]] == [49.0, 50.0, 51.0]
@@ -446,6 +451,12 @@ def unstable() -> dict[str, Any]:
     [
         (tuned(), {}, "add --plant"),
         (tuned(fingerprint="0123456789abcdef"), {"plant": "rig"}, "fingerprint 0123456789abcdef, 'rig' has"),
+        (tuned(plant="engine_vcm"), {"plant": "rig"}, "is for plant 'engine_vcm', not for 'rig'"),
+        (
+            tuned(points=[{"frequency_hz": 50.0, "gains": None, "cutoffs": None, "reason": "stroke"}]),
+            {"plant": "rig"},
+            r"no gains at 50 Hz \(stroke\)",
+        ),
         (tuned(points=[]), {"plant": "rig"}, "points"),
         ({"points": [{"frequency_hz": 50.0}]}, {"plant": "rig"}, "points.0.gains"),
         (tuned(points=tuned()["points"][::-1]), {"plant": "rig"}, "must rise"),

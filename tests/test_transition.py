@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tuning.loop import LoopFacts, RigModel, loop_facts
-from tuning.retune import predict
 from tuning.rule import scheduling_rule
+from tuning.steady import predict
 from tuning.sweep import simulate_sweep
 from tuning.transition import TransitionCertificate, check_transition, decay_of_function_1_s
 from twin.control.schedule import GainSchedule

@@ -13,7 +13,8 @@ from typing import Literal
 import numpy as np
 
 from tuning.loop import LoopFacts, RigModel, margin_grid, margins
-from tuning.retune import Retuner, TuningGoal, predict
+from tuning.retune import Retuner, TuningGoal
+from tuning.steady import predict
 from tuning.types import BudgetKind
 from twin.control.schedule import Gains, GainSchedule
 from twin.plant.config import Frozen, Plant

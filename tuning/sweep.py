@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from tuning.loop import LoopFacts, RigModel
-from tuning.retune import predict
+from tuning.steady import predict
 from twin.control.chain import CHAIN_STATES
 from twin.control.rig_block import rig_block
 from twin.control.schedule import Gains, GainSchedule

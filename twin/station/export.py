@@ -73,8 +73,8 @@ def hand_over(source: Source, options: ExportOptions, say: Callable[[str], None]
         budget = Budget(power_w=options.budget_w, kind=kind)
     watt, kind = (None, "joule_mean") if budget is None else (budget.power_w, budget.kind)
     points = point_figures(plant, facts, schedule, amplitude, watt, kind)
-    proof = check_transition(plant, facts, schedule, most_solves=options.solves, enough_hz_s=ENOUGH_HZ_S)
     table, effect = _rounded(source, amplitude, options, say)
+    proof = check_transition(plant, facts, schedule, most_solves=options.solves, enough_hz_s=ENOUGH_HZ_S)
     absorber = plant.absorber
     return Handover(
         plant=source.configured.name,
@@ -186,9 +186,9 @@ def export_table(result: dict[str, Any]) -> Table:
         least, delay = p["limit_displacement_m"], p["delay_margin_s"]
         table.add_row(
             f"{p['frequency_hz']:g}",
-            f"{1e6 * p['passive_displacement_m']:.3g}",
-            "-" if least is None else f"{1e6 * least:.3g}" if least > 1e-12 else "~0",
-            f"{1e6 * p['achieved_displacement_m']:.3g}",
+            _um(p["passive_displacement_m"]),
+            _um(least),
+            _um(p["achieved_displacement_m"]),
             f"{p['current_peak_a']:.3g}",
             f"{p['joule_mean_w']:.3g}",
             f"{p['electrical_mean_w']:.3g}",
@@ -216,3 +216,7 @@ def _summary(handover: Handover) -> list[str]:
             f"at most {100.0 * r.margin_lost:.2g} % of a margin lost, at {r.worst_hz:g} Hz"
         )
     return lines
+
+
+def _um(metres: float | None) -> str:
+    return "-" if metres is None else "~0" if metres < 1e-10 else f"{1e6 * metres:.3g}"

@@ -159,10 +159,11 @@ def _from_json(path: Path, options: ExportOptions) -> Source:
     budget = None
     if tuned.budget_w is not None:
         budget = Budget(power_w=tuned.budget_w, kind=tuned.budget_kind)
-    delay_us = DELAY_US if tuned.delay_us is None else tuned.delay_us
-    facts = loop_facts(tuned.sample_rate_hz, 1e-6 * delay_us)
+    if tuned.plant not in (None, plant.name):
+        raise InputError(f"{path}: is for plant '{tuned.plant}', not for '{plant.name}'; change --plant")
+    facts = loop_facts(tuned.sample_rate_hz, tuned.loop_delay_s)
     words = f"tuning {path.name}"
-    return Source(tuned.schedule(path), plant, plant, facts, budget, tuned.excitation_n, words)
+    return Source(tuned.schedule(path), plant, plant, facts, budget, tuned.excitation, words)
 
 
 def _from_handover(path: Path, text: str, options: ExportOptions) -> Source:
@@ -259,8 +260,9 @@ class _Loose(BaseModel):
 
 class _TunedPoint(_Loose):
     frequency_hz: Positive
-    gains: _Gains
-    cutoffs: _Cutoffs
+    gains: _Gains | None
+    cutoffs: _Cutoffs | None
+    reason: str = "no gains"
 
 
 class _Tuned(_Loose):
@@ -271,8 +273,8 @@ class _Tuned(_Loose):
     fingerprint: str | None = None
     budget_w: Positive | None = None
     budget_kind: BudgetKind = "joule_mean"
-    excitation_n: Positive | None = None
-    delay_us: float | None = Field(default=None, ge=0.0)
+    excitation: Positive | None = None
+    loop_delay_s: float = Field(default=1e-6 * DELAY_US, ge=0.0)
     sample_rate_hz: Positive = SAMPLE_RATE_HZ
 
     @model_validator(mode="after")
@@ -285,14 +287,21 @@ class _Tuned(_Loose):
     def schedule(self, path: Path) -> GainSchedule:
         """The points as a table; the controller acts between its ends."""
         hz = tuple(p.frequency_hz for p in self.points)
+        rows = [(p.gains, p.cutoffs) for p in self.points if p.gains is not None and p.cutoffs is not None]
+        if len(rows) < len(hz):
+            bare = next(p for p in self.points if p.gains is None or p.cutoffs is None)
+            raise InputError(
+                f"{path}: has no gains at {bare.frequency_hz:g} Hz ({bare.reason}); tune with a larger budget or a "
+                "narrower band"
+            )
         try:
             return GainSchedule(
                 frequency_hz=hz,
-                alpha_kg=tuple(p.gains.alpha_kg for p in self.points),
-                beta_ns_m=tuple(p.gains.beta_ns_m for p in self.points),
-                gamma_n_m=tuple(p.gains.gamma_n_m for p in self.points),
-                low_pass_hz=tuple(p.cutoffs.low_pass_hz for p in self.points),
-                high_pass_hz=tuple(p.cutoffs.high_pass_hz for p in self.points),
+                alpha_kg=tuple(gains.alpha_kg for gains, _ in rows),
+                beta_ns_m=tuple(gains.beta_ns_m for gains, _ in rows),
+                gamma_n_m=tuple(gains.gamma_n_m for gains, _ in rows),
+                low_pass_hz=tuple(cutoffs.low_pass_hz for _, cutoffs in rows),
+                high_pass_hz=tuple(cutoffs.high_pass_hz for _, cutoffs in rows),
                 on_from_hz=hz[0],
                 on_to_hz=hz[-1],
             )
