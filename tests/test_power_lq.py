@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import differential_evolution
 
 from tuning.excited import ExcitedPlant, balance, excited_plant
-from tuning.lq_kernels import double, excited_covariance, excited_sine, joint_moments, solve_care
+from tuning.lq_kernels import excited_covariance, excited_sine, joint_moments, solve_care
 from tuning.power_lq import LQDesign, PowerBudgetedLQ
 from twin.control.lq import force_model
 from twin.plant.config import Body, ForceActuator, Plant, VoiceCoil
@@ -95,14 +95,6 @@ def test_doubling_solves_random_riccati_equations_as_scipy_does(seed: int, n: in
     expected, _, _ = control.care(A, b[:, None], Q, np.array([[R]]), N[:, None], method="scipy")
     np.testing.assert_allclose(P, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
     assert error < 1e-10
-
-
-def test_doubling_solves_the_discrete_equation_too() -> None:
-    rng = np.random.default_rng(4)
-    F, g = 0.5 * rng.standard_normal((4, 4)), rng.standard_normal(4)
-    P = double(F, np.outer(g, g) / 0.3, np.eye(4))
-    expected, _, _ = control.dare(F, g[:, None], np.eye(4), np.array([[0.3]]), method="scipy")
-    np.testing.assert_allclose(P, expected, rtol=1e-9)
 
 
 def test_covariance_and_sine_are_those_of_a_lyapunov_solve_and_of_phasors(engine: PowerBudgetedLQ) -> None:

@@ -7,6 +7,7 @@ oscillator's line, nothing here comes near the imaginary axis, where a Riccati s
 
 import numpy as np
 
+from estimators.riccati import double
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
 
@@ -24,24 +25,6 @@ def solve_sylvester(A: Array, B: Array, C: Array) -> Array:
             for k in range(m):
                 big[row, i * m + k] += B[k, j]
     return np.linalg.solve(big, C.copy().reshape(n * m)).reshape(n, m)
-
-
-@kernel
-def double(step: Array, low: Array, high: Array) -> Array:
-    """Stabilising solution of ``P = H + F'P (1 + G P)^-1 F`` from F, G and H, by structure-preserving doubling.
-
-    Every round covers twice the time of the one before: thirty reach a thousand million samples.
-    """
-    eye = np.eye(len(step))
-    for _ in range(60):
-        inner = np.linalg.inv(eye + low @ high)
-        more = step.T @ high @ inner @ step
-        low = low + step @ inner @ low @ step.T
-        step = step @ inner @ step
-        high = high + more
-        if np.max(np.abs(more)) <= 1e-15 * np.max(np.abs(high)):
-            break
-    return 0.5 * (high + high.T)
 
 
 @kernel
@@ -65,7 +48,9 @@ def solve_care(A: Array, b: Array, Q: Array, R: float, N: Array) -> tuple[Array,
     step = eye + 2.0 * gamma * W.T
     low = 2.0 * gamma * inverse @ G @ W
     high = 2.0 * gamma * W @ H @ inverse
-    P = double(step, low, high)
+    if not double(step, low, high):
+        return high, np.inf
+    P = 0.5 * (high + high.T)
     # Newton's method (Kleinman) makes good what the doubling lost: each step is a Lyapunov equation.
     for _ in range(2):
         K = (b @ P + N) / R

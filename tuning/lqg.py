@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimators.riccati import double, steady_prior
 from tuning.law_loop import LawLoop, StateSpaceLaw, SteadyState
 from tuning.loop import LoopFacts, Margins
-from tuning.lq_kernels import double
 from tuning.power_lq import LQDesign, PowerBudgetedLQ
 from tuning.sampled import SampledPlant, sampled_plant
 from twin.plant.config import Plant
@@ -346,7 +346,9 @@ class _Joint:
         g[:n], Qp[:n, :n], Qe[:n] = self.late[:n], Q[:n, :n], Q[:n, n:]
         if fraction:
             Fp[:n, n], g[n] = self.early[:n], 1.0
-        P = double(Fp, np.outer(g, g) / R, Qp)
+        P, step = Qp.copy(), Fp.copy()
+        if not double(step, np.outer(g, g) / R, P):
+            raise RunError("the discrete LQ problem has no solution for these weights")
         stiff = R + g @ P @ g
         own = g @ P @ Fp / stiff
         closed = Fp - np.outer(g, own)
@@ -358,7 +360,7 @@ class _Joint:
     def observer(self, caution: float) -> Array:
         """Stationary Kalman gain (n + 2, p) from the innovation to the estimate at the same sample."""
         plant, n = self.plant, self.own
-        rate, k = plant.facts.sample_rate_hz, plant.coil.force_constant_n_a
+        rate = plant.facts.sample_rate_hz
         noise = np.zeros((n + 2, n + 2))
         noise[n + 1, n + 1] = 4.0 * self.bandwidth * self.w / rate
         model = self.lq.excited
@@ -374,11 +376,8 @@ class _Joint:
             moved = way / self.scale
             noise += np.outer(moved, moved) * 0.5 * density**2 / rate
         sensors = np.diag((caution * plant.noise_density) ** 2 * 0.5 * rate)
-        ahead = double(
-            np.ascontiguousarray(self.F.T),
-            np.ascontiguousarray(self.C.T @ np.linalg.solve(sensors, self.C)),
-            noise,
-        )
-        if not np.isfinite(ahead).all():
-            raise RunError(f"the observer's Riccati equation has no solution (force constant {k:g} N/A)")
+        try:
+            ahead = steady_prior(self.F, self.C, noise, sensors)
+        except np.linalg.LinAlgError as error:
+            raise RunError(f"the observer has no steady state: {error}") from error
         return np.asarray(np.linalg.solve(self.C @ ahead @ self.C.T + sensors, self.C @ ahead).T)
