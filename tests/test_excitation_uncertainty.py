@@ -150,7 +150,8 @@ def test_harmonics_are_told_with_their_phase_and_what_they_are_worth() -> None:
         thd, thd_std = p.distortion()
         distortion.append((thd[0] - truth) / thd_std[0])
         frequency.append((p.frequency_hz - 48.7) / p.frequency_std_hz)
-        assert np.all(np.isfinite(thd)) and np.all(thd >= 0.0)
+        assert np.all(np.isfinite(thd))
+        assert np.all(thd >= 0.0)
         assert abs(np.angle(turned[1] / parts[3])) < 0.05
     assert np.all(np.mean(inside, axis=0) > 0.9)
     assert 0.8 < np.std(distortion) < 1.25
@@ -252,9 +253,11 @@ def test_dead_channel_leaves_the_others_alone_and_claims_nothing() -> None:
     p = found(track(values)[-1])
     assert p.frequency_hz == pytest.approx(50.0, abs=1e-3)
     assert p.amplitude[1] == 0.0
-    assert math.isinf(p.variance[1]) and math.isinf(p.slope_variance[1])
+    assert math.isinf(p.variance[1])
+    assert math.isinf(p.slope_variance[1])
     thd, std = p.distortion()
-    assert thd[1] == 0.0 and math.isinf(std[1])
+    assert thd[1] == 0.0
+    assert math.isinf(std[1])
     values[5 * BLOCK :, 0] = np.nan
     assert track(values)[-1] is None
 
