@@ -104,7 +104,8 @@ class Designer:
             stability = self._stability(situation, cutoffs_hz, demands, terms, margin, late)
             search = GainSearch(self._scale, self._bounds, conditions, stability, unit)
             if first is None:
-                first = self._starts(conditions[0], wish_a, terms[0], margin)
+                curves = [terms[0], *self._late(situation, terms[0], demands)]
+                first = self._starts(conditions[0], wish_a, curves, margin)
             found = self._best(search, first)
             alpha, beta, gamma = (float(x) for x in found.numbers)
             gains = Gains(alpha, beta, gamma, *cutoffs_hz)
@@ -117,7 +118,7 @@ class Designer:
                 break
             margin += 1.5 * max(short, 0.0) + (1e-5 if short > 0.0 else 0.0)
             late += LATE_MARGIN if hasty else 0.0
-            first = [found.numbers]
+            first = [found.numbers, *first] if hasty else [found.numbers]
         return Design(
             gains, _prices(found, conditions[0], gains, situation.paths, demands, unit, kind), found
         )
@@ -149,11 +150,9 @@ class Designer:
         late: float,
     ) -> Stability:
         curves, least = list(terms), [margin] * len(terms)
-        if demands.delay_margin_s > 0.0:
-            for share in DELAYS:
-                turn = np.exp(-2j * np.pi * situation.design_grid * demands.delay_margin_s * share)
-                curves.append(terms[0] * turn[:, None])
-                least.append(min(late, 0.5 + 0.5 * margin))
+        delayed = self._late(situation, terms[0], demands)
+        curves += delayed
+        least += [min(late, 0.5 + 0.5 * margin)] * len(delayed)
         n = len(situation.design_grid)
         first = np.zeros(n * len(curves), dtype=np.bool_)
         first[::n] = True
@@ -163,10 +162,19 @@ class Designer:
         wanted = demands.slowest_decay_1_s * (1.0 + 1e-4)
         return Stability(np.vstack(curves), np.repeat(least, n), first, decaying, wanted, cutoffs_hz)
 
+    @staticmethod
+    def _late(situation: Situation, terms: ComplexArray, demands: Demands) -> list[ComplexArray]:
+        """The loop with parts of the further delay that it must stand, and with all of it."""
+        if demands.delay_margin_s == 0.0:
+            return []
+        turn = -2j * np.pi * situation.design_grid * demands.delay_margin_s
+        return [terms * np.exp(turn * share)[:, None] for share in DELAYS]
+
     def _starts(
-        self, condition: Condition, wish_a: complex, terms: ComplexArray, margin: float
+        self, condition: Condition, wish_a: complex, curves: list[ComplexArray], margin: float
     ) -> list[Array]:
-        found = starts(condition, wish_a, terms, margin, self._scale, self._bounds)
+        terms = curves[0]
+        found = starts(condition, wish_a, curves, margin, self._scale, self._bounds)
         best = found[0]
         if float(np.min(np.abs(1.0 + terms @ best))) < margin:
             per_ampere, alone = condition.acceleration
