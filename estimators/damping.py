@@ -195,6 +195,10 @@ class DampingLearner:
         """Standard deviation of the learned value at a frequency [Ns/m]."""
         return self._damping.std_at(frequency_hz, self.settings.timing_std_s)
 
+    def noise_std_at(self, frequency_hz: float) -> float:
+        """Return the part of it that is noise, without the doubt about the channels' delays [Ns/m]."""
+        return self._damping.std_at(frequency_hz, 0.0)
+
     def state(self) -> dict[str, Any]:
         """What has been learned, as plain data that `restored` reads back."""
         return {

@@ -100,6 +100,9 @@ def test_one_sweep_teaches_the_damping_of_the_thesis_from_a_wrong_start(
     assert np.all(last.std_ns_m[inside] < 0.3)
     assert np.all(np.abs(error) < 2.0 * last.std_ns_m[inside])
     assert np.all(last.coverage[inside] > 0.99)
+    for f, std, noise in zip(last.frequency_hz, last.std_ns_m, last.noise_std_ns_m, strict=True):
+        assert learner.std_at(f) == pytest.approx(std)
+        assert learner.noise_std_at(f) == pytest.approx(noise)
     assert last.stiffness_n_m == pytest.approx(40714.0, abs=3.0 * last.stiffness_std_n_m)
     assert last.stiffness_std_n_m < 50.0
     stiffness = (last.stiffness_curve_n_m - 40714.0)[inside] / last.stiffness_curve_std_n_m[inside]
