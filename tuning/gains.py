@@ -20,7 +20,8 @@ ROWS, KEPT = 20, 6
 ROUNDS = 8
 PROXIMAL = 0.1
 REGULARITY = 1e-9
-RHO = 0.1
+PENALTIES = (0.1, 1.0, 10.0)
+"""OSQP's step size: the first serves nearly always, the others where it creeps."""
 
 
 class GainProgram:
@@ -112,14 +113,19 @@ class GainProgram:
         if self._solver is None:
             self._solver = osqp.OSQP()
             self._solver.setup(
-                P, linear, A, lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=4_000,
-                rho=RHO, scaling=0, adaptive_rho=False,  # both would carry bits of one question into the next
+                P, linear, A, lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=1_000,
+                rho=PENALTIES[0], scaling=0, adaptive_rho=False,  # both would carry bits of one question into the next
             )  # fmt: skip
         # Also after setup, so that the first question is answered to the same bits as when it is asked again.
         self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
-        # Rows change places from round to round: their multipliers are no start for each other.
-        self._solver.warm_start(x=warm, y=np.zeros(ROWS + 3))
-        result = self._solver.solve(raise_error=False)
+        x, y = np.asarray(warm), np.zeros(ROWS + 3)  # rows change places: their multipliers are no start
+        for penalty in PENALTIES:
+            self._solver.update_settings(rho=penalty)
+            self._solver.warm_start(x=x, y=y)
+            result = self._solver.solve(raise_error=False)
+            if result.info.status_val != osqp.SolverStatus.OSQP_MAX_ITER_REACHED:
+                break
+            x, y = result.x, result.y
         if result.info.status_val not in (
             osqp.SolverStatus.OSQP_SOLVED,
             osqp.SolverStatus.OSQP_SOLVED_INACCURATE,

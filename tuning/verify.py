@@ -22,6 +22,7 @@ ROUNDING = 1e-9
 CHECK_POINTS = 150
 DESIGN_POINTS = 36
 DELAYS = (0.5, 1.0)
+VALLEYS, BETWEEN = 3, 41
 
 
 class Situation:
@@ -108,7 +109,26 @@ class Situation:
         chain = self._chain(self._check_grid, (gains.low_pass_hz, gains.high_pass_hz))
         found = [margins(-a[:, None] * chain, self._check_grid, gains) for a in self._check_accelerations]
         delay = min((m.delay_s for m in found if m.delay_s is not None), default=None)
-        return Margins(min(m.modulus for m in found), delay)
+        deepest = min(
+            self._bottom(model, a, chain, gains)
+            for model, a in zip(self.models, self._check_accelerations, strict=True)
+        )
+        return Margins(min(deepest, *(m.modulus for m in found)), delay)
+
+    def _bottom(
+        self, model: RigModel, acceleration: ComplexArray, chain: ComplexArray, gains: Gains
+    ) -> float:
+        """Least |1 + L| in the deepest valleys, looked at again between the grid's points."""
+        law = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
+        distance = np.abs(1.0 - acceleration * (chain @ law))
+        inner = np.nonzero((distance[1:-1] <= distance[:-2]) & (distance[1:-1] <= distance[2:]))[0] + 1
+        deepest = inner[np.argsort(distance[inner], kind="stable")[:VALLEYS]]
+        if not len(deepest):
+            return float(distance.min())
+        grid = self._check_grid
+        fine = np.concatenate([np.linspace(grid[k - 1], grid[k + 1], BETWEEN) for k in deepest])
+        path = self._chain(fine, (gains.low_pass_hz, gains.high_pass_hz)) @ law
+        return float(np.min(np.abs(1.0 - model.acceleration(fine) * path)))
 
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of all models [1/s]; below 0 is stable."""
