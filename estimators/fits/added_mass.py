@@ -132,9 +132,10 @@ def fit_added_mass(
         stiffness, mass = np.exp(log[0]), np.exp(log[1]) - _shift(added)
         return np.asarray(np.sqrt(stiffness / (mass + added)) / TAU)
 
-    found = least_squares(
-        lambda q: (hz - model(q)) / std, first, x_scale=[0.01, 0.01], ftol=1e-14, xtol=1e-14
-    )
+    def residual(log: Array) -> Array:
+        return np.asarray((hz - model(log)) / std)
+
+    found = least_squares(residual, first, x_scale=[0.01, 0.01], ftol=1e-14, xtol=1e-14)
     stiffness, mass = float(np.exp(found.x[0])), float(np.exp(found.x[1]) - _shift(added))
     at = model(found.x)
     jacobian = np.column_stack([at / (2.0 * stiffness), -at / (2.0 * (mass + added))]) / std[:, None]

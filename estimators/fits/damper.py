@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 
@@ -18,6 +19,7 @@ from estimators.fits.types import Estimate
 from twin.plant.errors import InputError
 from twin.plant.linear import Array
 
+TRUNCATE = 7.0
 SYSTEMATIC = 0.05
 """A linear damper is adequate while what it leaves and the motion explains is below this share of the force."""
 
@@ -134,11 +136,16 @@ def smooth_motion(force: Array, displacement: Array, sample_rate_hz: float, name
     top_hz = (
         float(hz[np.searchsorted(np.cumsum(power), 0.98 * np.sum(power))]) if np.sum(power) > 0.0 else hz[-1]
     )
-    sigma = float(np.clip(sample_rate_hz / (2.0 * np.pi * 2.0 * max(top_hz, 1e-12)), 0.8, len(x) / 40.0))
-    cut = slice(int(4.0 * sigma) + 1, len(x) - int(4.0 * sigma) - 1)
-    smooth = [gaussian_filter1d(displacement, sigma, order=o) * sample_rate_hz**o for o in range(3)]
+    sigma = float(np.clip(sample_rate_hz / (2.0 * np.pi * 2.0 * max(top_hz, 1e-12)), 1.0, len(x) / 40.0))
+    edge = int(TRUNCATE * sigma) + 1
+    cut = slice(edge, len(x) - edge)
+    smooth = [gaussian_filter1d(x, sigma, order=o, truncate=TRUNCATE) * sample_rate_hz**o for o in range(3)]
     return DamperRecord(
-        name, gaussian_filter1d(force, sigma)[cut], smooth[0][cut], smooth[1][cut], smooth[2][cut]
+        name,
+        gaussian_filter1d(force, sigma, truncate=TRUNCATE)[cut],
+        smooth[0][cut],
+        smooth[1][cut],
+        smooth[2][cut],
     )
 
 
@@ -166,13 +173,14 @@ def fit_damper(records: Sequence[DamperRecord], sample_rate_hz: float) -> Damper
     adequate = systematic <= SYSTEMATIC and not differs
     if systematic > SYSTEMATIC:
         reason = (
-            f"{100 * systematic:.0f} % of the force is left by the linear fit and follows the motion: friction or hysteresis, "
-            "not noise"
+            f"{100 * systematic:.0f} % of the force is left by the linear fit and follows the motion: "
+            "friction or hysteresis, not noise"
         )
     elif differs:
         reason = f"c differs from record to record by {100 * spread:.0f} %, far more than its errors"
     else:
-        reason = f"what the linear fit leaves does not follow the motion (less than {100 * SYSTEMATIC:.0f} % of the force)"
+        share = f"less than {100 * SYSTEMATIC:.0f} % of the force"
+        reason = f"what the linear fit leaves does not follow the motion ({share})"
     return DamperFit(c, k, m, nrmse, systematic, adequate, reason, lost, tuple(fits))
 
 
@@ -241,7 +249,7 @@ def _samples_per_cycle(velocity: Array) -> float:
     return float(len(v) / max(1, len(up)))
 
 
-def _crossings(v: Array) -> Array:
+def _crossings(v: Array) -> NDArray[np.int64]:
     """Upward passages through zero, counted once where noise crosses several times."""
     level = 0.2 * float(np.std(v))
     state, out = v[0] > 0.0, []
@@ -344,8 +352,6 @@ def _not_identifiable(
         {"m": (m, "acceleration")} if m is not None else {}
     )
     for name, (estimate, series) in named.items():
-        if estimate is None:
-            continue
         share = max(
             abs(estimate.value)
             * float(np.std(getattr(r, series)))

@@ -8,6 +8,7 @@ where their amplitude passes the edges of bands, and each band is fitted for its
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -125,7 +126,7 @@ def fit_decay(
         alone[k][d.first : d.end] -= _other_modes(whole, pieces[k], sample_rate_hz)
     chosen = sorted(edges) if edges is not None else _edges(decays, main.damping_ratio)
     bands = []
-    for low, high in zip(chosen[:-1], chosen[1:], strict=True):
+    for low, high in pairwise(chosen):
         band = _band(alone, decays, sample_rate_hz, main, low, high)
         if band is not None:
             bands.append(band)
@@ -133,7 +134,8 @@ def fit_decay(
         reach = (min(d.amplitude[1] for d in decays), max(d.amplitude[0] for d in decays))
         if edges is not None:
             raise InputError(
-                f"no decay has {FEWEST_PERIODS:g} periods in any band; amplitudes run from {reach[1]:.3g} down to {reach[0]:.3g}"
+                f"no decay has {FEWEST_PERIODS:g} periods in any band; "
+                f"amplitudes run from {reach[1]:.3g} down to {reach[0]:.3g}"
             )
         periods = sum(d.end - d.first for d in decays) * main.frequency_hz / sample_rate_hz
         bands = [AmplitudeBand(*reach, main, len(decays), periods)]

@@ -125,6 +125,10 @@ def find_decays(values: Array, sample_rate_hz: float, frequency_hz: float) -> li
         top = int(np.argmax(candidates))
         if candidates[top] <= max(0.02 * float(np.max(amplitude)), floor):
             break
+        # Noise may put the largest value late in a slow decay: the decay begins with the first one nearly as large.
+        nearly = amplitude[top] - max(0.02 * amplitude[top], 6.0 * seen.noise)
+        while top > 0 and candidates[top - 1] > nearly:
+            top -= 1
         last, smallest = top, amplitude[top]
         while (
             last + 1 < len(amplitude)

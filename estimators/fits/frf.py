@@ -160,7 +160,9 @@ def _candidates(f: Array, h: ComplexArray) -> tuple[Stabilisation, Array]:
         if p.found > STEADY and not any(near):
             out.append((p.frequency_hz, p.damping_ratio))
     # A broad pole with a sharp one inside fits what the sharp one leaves; the remainder is there for that.
-    out = [(a, z) for a, z in out if not any(abs(a - b) < a * z and 5.0 * b * y < a * z for b, y in out)]
+    out = [
+        (a, z) for a, z in out if not any(abs(a - b) < 3.0 * a * z and 5.0 * b * y < a * z for b, y in out)
+    ]
     pairs = np.array(sorted((a, max(z, 0.05 * spacing / a)) for a, z in out)).reshape(-1, 2)
     return flat, pairs[:MOST_CANDIDATES]
 

@@ -135,15 +135,16 @@ def fit_once(f: Array, h: ComplexArray, theta: Array, variance: Array, window: W
             shift = np.zeros(len(now))
             shift[p] = SMALL * steps[p]
             mode = slice(2 * (p // 2), 2 * (p // 2) + 2)
-            ahead = mode_columns(s, *(now + shift)[mode], window)
-            behind = mode_columns(s, *(now - shift)[mode], window)
+            above, below = (now + shift)[mode], (now - shift)[mode]
+            ahead = mode_columns(s, float(above[0]), float(above[1]), window)
+            behind = mode_columns(s, float(below[0]), float(below[1]), window)
             for k, w in enumerate(weights):
                 one, j = own[k, p // 2].real, own[k, p // 2].imag
                 change = (one * (ahead[0] - behind[0]) + j * (ahead[1] - behind[1])) / (2.0 * shift[p])
                 out[k][:, p] = np.concatenate([change.real, change.imag]) * w
         return out
 
-    s = 1j * TAU * f
+    s: ComplexArray = np.asarray(1j * TAU * f, dtype=np.complex128)
     pairs = theta.reshape(-1, 2)
     spacing = float(np.median(np.diff(f)))
     width = np.maximum(pairs[:, 0] * np.abs(pairs[:, 1]), 0.05 * spacing)
@@ -217,7 +218,7 @@ def _prominence(f: Array, h: ComplexArray, found: SeparableFit, window: Window) 
     for m, (hz, zeta) in enumerate(found.theta.reshape(-1, 2)):
         at = int(np.clip(np.searchsorted(f, hz), 1, len(f) - 1))
         near = slice(at - 1, at + 1)
-        one, j = mode_columns(1j * TAU * f[near], hz, zeta, window)
+        one, j = mode_columns(np.asarray(1j * TAU * f[near], dtype=np.complex128), hz, zeta, window)
         for k, c in enumerate(found.coefficients):
             own = c[2 * m] * one + c[2 * m + 1] * j
             out[m] = max(out[m], float(np.max(np.abs(own) / (np.abs(h[near, k] - own) + 1e-300))))

@@ -108,11 +108,11 @@ def stabilise(
     rows: list[tuple[int, float, float, bool]] = []
     before = np.zeros(0, dtype=np.complex128)
     for order, poles in zip(orders, poles_by_order(frequency_hz, response, weight, orders), strict=True):
-        for p in poles:
-            rows.append((order, abs(p) / TAU, -p.real / abs(p), _has(before, p)))
+        rows += [(order, abs(p) / TAU, -p.real / abs(p), _has(before, p)) for p in poles]
         before = poles
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    return Stabilisation(*table.T, _clusters(table, orders, frequency_hz[1] - frequency_hz[0]))
+    steady = _clusters(table, orders, float(frequency_hz[1] - frequency_hz[0]))
+    return Stabilisation(table[:, 0], table[:, 1], table[:, 2], table[:, 3], steady)
 
 
 def _has(poles: ComplexArray, wanted: complex) -> bool:

@@ -64,7 +64,7 @@ def modal_basis(frequency_hz: Array, theta: Array, window: Window) -> Array:
     theta
         (2 n_modes,) natural frequency [Hz] and damping ratio, mode by mode.
     """
-    s = 1j * TAU * frequency_hz
+    s: ComplexArray = np.asarray(1j * TAU * frequency_hz, dtype=np.complex128)
     columns: list[ComplexArray] = []
     for f, zeta in theta.reshape(-1, 2):
         columns += mode_columns(s, f, zeta, window)

@@ -99,9 +99,9 @@ def fit_separable(
         np.asarray(start, dtype=np.float64), low + 1e-9 * (high - low), high - 1e-9 * (high - low)
     )
     found = least_squares(
-        lambda theta: np.concatenate(problem.at(theta).residuals),
+        problem.residual,
         first,
-        jac=lambda theta: -np.concatenate(problem.jacobians(theta)),
+        jac=problem.descent,
         bounds=(low, high),
         x_scale=problem.steps,
         ftol=1e-10,
@@ -176,6 +176,14 @@ class _Problem:
             point.residuals.append(y - span @ (span.T @ y))
         self._last = point
         return point
+
+    def residual(self, theta: Array) -> Array:
+        """All residuals in a row."""
+        return np.concatenate(self.at(theta).residuals)
+
+    def descent(self, theta: Array) -> Array:
+        """Derivatives of `residual`."""
+        return -np.concatenate(self.jacobians(theta))
 
     def jacobians(self, theta: Array) -> list[Array]:
         """Derivatives of the model by theta, less what the coefficients can take up."""

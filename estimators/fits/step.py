@@ -9,6 +9,7 @@ where a driver distorts the edge or the path has a zero. The forced model is use
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -142,7 +143,9 @@ def fit_steps(pieces: Sequence[StepPiece], sample_rate_hz: float) -> StepFit:
 
 
 def second_order(drive: Array, sample_rate_hz: float, frequency_hz: float, damping_ratio: float) -> Array:
-    """Response of ``w²/(s² + 2 zeta w s + w²)`` to an input that is linear between samples, from rest at its first value.
+    """Response of ``w²/(s² + 2 zeta w s + w²)`` to an input that is linear between samples.
+
+    It rests at the input's first value.
 
     Exact for such inputs: the ramp-invariant discretisation.
 
@@ -171,7 +174,7 @@ def second_order(drive: Array, sample_rate_hz: float, frequency_hz: float, dampi
         a[0, 1] * b0[1] - a[1, 1] * b0[0],
     ])  # fmt: skip
     u = drive - drive[0]
-    return np.asarray(lfilter(numerator, [1.0, -trace, det], u)) + drive[0]
+    return np.asarray(lfilter(numerator, [1.0, -trace, det], u) + drive[0], dtype=np.float64)
 
 
 def _forced(
@@ -185,12 +188,8 @@ def _forced(
     theta, steps = [start[0], start[1], 0.0], [0.02 * start[0], 0.02, 0.02 / start[0]]
     if not measured:
         # An ideal step has a rise as well, at least what fits between two samples.
-        (
-            low.append(0.0),
-            high.append(1.5 / start[0]),
-            theta.append(1.0 / rate_hz),
-            steps.append(0.02 / start[0]),
-        )
+        low, high = [*low, 0.0], [*high, 1.5 / start[0]]
+        theta, steps = [*theta, 1.0 / rate_hz], [*steps, 0.02 / start[0]]
 
     def bases(now: Array) -> list[Array]:
         out = []
@@ -228,7 +227,7 @@ def _ramp_response(t: Array, rise_s: float, frequency_hz: float, damping_ratio: 
         lag = 2.0 * damping_ratio / w
         return np.asarray(x - lag + lag * c + (2.0 * damping_ratio**2 - 1.0) * s)
 
-    return (ramp(t) - ramp(t - rise_s)) / rise_s
+    return np.asarray((ramp(t) - ramp(t - rise_s)) / rise_s)
 
 
 def _free(pieces: Sequence[StepPiece], rate_hz: float, start: tuple[float, float]) -> RingingFit | None:
@@ -264,11 +263,7 @@ def _first_guess(pieces: Sequence[StepPiece], rate_hz: float) -> tuple[float, fl
         crossings = np.flatnonzero(sign[1:] * sign[:-1] < 0)
         if len(crossings) >= 3:
             frequencies.append(0.5 * rate_hz * (len(crossings) - 1) / (crossings[-1] - crossings[0]))
-            swings = [
-                np.max(np.abs(error[a : b + 1]))
-                for a, b in zip(crossings[:-1], crossings[1:], strict=True)
-                if b > a
-            ]
+            swings = [np.max(np.abs(error[a : b + 1])) for a, b in pairwise(crossings) if b > a]
             drop = (
                 -np.polyfit(np.arange(len(swings)), np.log(np.maximum(swings, 1e-12)), 1)[0]
                 if len(swings) > 1
@@ -307,7 +302,7 @@ def _placed(tails: Sequence[Array], pieces: Sequence[StepPiece]) -> tuple[Array,
 
 
 def _unit(drive: Array) -> Array:
-    return (drive - drive[0]) / max(float(np.ptp(drive)), 1e-300)
+    return np.asarray((drive - drive[0]) / max(float(np.ptp(drive)), 1e-300))
 
 
 def _pair(mode: Mode) -> tuple[float, float]:

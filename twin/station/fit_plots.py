@@ -83,7 +83,7 @@ def response_plot(f: Array, h: Array | ComplexArray, fit: TransmissibilityFit) -
         axes = figure.subplots(rows, 1, sharex=True, height_ratios=[3, 1.4, 1.2][:rows])
         m = fit.mode
         axes[0].semilogy(f, np.abs(h), ".", color=DATA, ms=4, label="measured")
-        label = f"{m.frequency_hz:.4g} ± {m.frequency_std_hz:.2g} Hz, damping {m.damping_ratio:.3g} ± {m.damping_std:.2g}"
+        label = f"{m.frequency_hz:.6g} ± {m.frequency_std_hz:.1g} Hz, ζ {m.damping_ratio:.4g} ± {m.damping_std:.1g}"
         axes[0].semilogy(f, np.abs(fit.model), color=MODEL, lw=1.2, label=label)
         dress(axes[0], "", "transmissibility [-]", "Absorber over table (thesis eq. 5-4)")
         if rows == 3:
@@ -131,7 +131,8 @@ def frf_plot(f: Array, h: ComplexArray, fit: FrfFit, names: list[str], unit: str
                 axes.plot(f[near], np.abs(fit.model[near, k]), "--", color=MODEL, lw=1)
             std = fit.noise_std[near, 0]
             axes.fill_between(f[near], 0.0, std, color="#cfd8dc", lw=0)
-            title = f"{mode.frequency_hz:.3f} ± {mode.frequency_std_hz:.1g} Hz\nζ {mode.damping_ratio:.5f} ± {mode.damping_std:.1g}"
+            title = f"{mode.frequency_hz:.3f} ± {mode.frequency_std_hz:.1g} Hz\n"
+            title += f"ζ {mode.damping_ratio:.5f} ± {mode.damping_std:.1g}"
             dress(axes, "frequency [Hz]", "|response|" if column == 0 else "", title, legend=False)
 
     return draw
@@ -211,7 +212,8 @@ def step_plot(pieces: list[StepPiece], rate_hz: float, fit: StepFit, unit: str) 
         zeta = np.array([m.damping_ratio for m in fit.each])
         each.errorbar(
             hz, zeta, 1.96 * np.array([m.damping_std for m in fit.each]),
-            1.96 * np.array([m.frequency_std_hz for m in fit.each]), fmt="o", color=OTHER, ms=3, lw=0.8, label="single steps",
+            1.96 * np.array([m.frequency_std_hz for m in fit.each]), fmt="o", color=OTHER, ms=3, lw=0.8,
+            label="single steps",
         )  # fmt: skip
         m = fit.mode
         each.errorbar(
@@ -245,18 +247,17 @@ def damper_plot(records: list[DamperRecord], fit: DamperFit, units: tuple[str, s
             panel.legend(fontsize=8, markerscale=8, edgecolor="#e0e4e7")
         axes[2].plot(r.velocity, one.residual, ".", color=MODEL, ms=1.2)
         axes[2].axhline(0.0, color="black", lw=0.8)
-        verdict = (
-            "a linear damper describes the data"
-            if fit.linear_adequate
-            else "a linear damper does not describe the data"
-        )
+        verdict = "adequate" if fit.linear_adequate else "NOT adequate"
+        what = f"velocity [{units[2]}]"
         dress(
             axes[2],
-            f"velocity [{units[2]}]",
+            what,
             f"left by the linear fit [{units[0]}]",
-            f"Verdict: {verdict}",
+            f"A linear damper is {verdict}",
             legend=False,
         )
+        for panel in axes:
+            panel.locator_params(axis="x", nbins=5)
 
     return draw
 

@@ -5,18 +5,19 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.fits.added_mass import TAU, fit_added_mass
 from estimators.fits.damper import DamperRecord, fit_damper, smooth_motion
 from estimators.fits.decay import fit_decay
 from estimators.fits.frf import fit_frf
-from estimators.fits.modal_model import ResponseKind, Window
+from estimators.fits.modal_model import ResponseKind, Window, WindowKind
 from estimators.fits.step import StepPiece, fit_steps
 from estimators.fits.step_finding import find_steps, squareness
 from estimators.fits.transmissibility import fit_transmissibility
 from estimators.fits.types import Estimate
 from twin.plant.errors import InputError
-from twin.plant.linear import Array, ComplexArray
+from twin.plant.linear import Array
 from twin.station import fit_plots
 from twin.station.fit_data import Series, TestFile, unit_of
 from twin.station.fit_plots import Draw
@@ -89,7 +90,8 @@ def run_frf(file: TestFile, band: Band, n_modes: int | None, window: str | None,
         fit = fit_frf(f, h, kind=known, n_modes=n_modes, window=cut)
     if fit.preferred_window is not None:
         file.notes.append(
-            f"the peaks would fit much better as measured with window '{fit.preferred_window}'; if they were, say so with --window"
+            f"the peaks would fit much better as measured with window '{fit.preferred_window}'; "
+            "if they were, say so with --window"
         )
     result = {
         "file": str(file.path),
@@ -312,10 +314,7 @@ def _signal(file: TestFile) -> Series:
 def _step_channels(file: TestFile) -> tuple[list[Series], list[Series]]:
     real = [s for s in file.series if not np.iscomplexobj(s.values)]
     channels = {s.channel: [o for o in real if o.channel == s.channel] for s in real}
-    if "output" in file.chosen:
-        outputs = file.pick("output")
-    else:
-        outputs = []
+    outputs = file.pick("output") if "output" in file.chosen else []
     if "input" in file.chosen:
         inputs = [] if file.chosen["input"].array == "none" else file.pick("input")
     else:
@@ -344,6 +343,17 @@ def _jump(values: Array) -> float:
     return float(np.ptp(values)) if len(values) else 0.0
 
 
+_WINDOWS: Mapping[str, WindowKind] = {
+    "none": "none", "uniform": "rectangular", "rectangular": "rectangular", "boxcar": "rectangular",
+    "hann": "hann", "hanning": "hann", "exponential": "exponential",
+}  # fmt: skip
+_KINDS: Mapping[ResponseKind, tuple[str, ...]] = {
+    "receptance": ("receptance", "compliance", "m/n"),
+    "mobility": ("mobility",),
+    "accelerance": ("accelerance", "inertance"),
+}
+
+
 def _window(file: TestFile, option: str | None, spacing_hz: float) -> Window:
     said = option if option is not None else str(file.facts.get("window", "")) or None
     if said is None:
@@ -353,7 +363,7 @@ def _window(file: TestFile, option: str | None, spacing_hz: float) -> Window:
         )
         return Window()
     name, _, length = said.strip().lower().partition(":")
-    names: Mapping[str, str] = {"none": "none", "uniform": "rectangular", "rectangular": "rectangular", "boxcar": "rectangular", "hann": "hann", "hanning": "hann", "exponential": "exponential"}  # fmt: skip
+    names = _WINDOWS
     if name not in names or (name == "exponential" and not length):
         raise InputError(f"--window {said}: known are none, rectangular, hann and exponential:SECONDS")
     try:
@@ -362,16 +372,16 @@ def _window(file: TestFile, option: str | None, spacing_hz: float) -> Window:
         raise InputError(f"--window {said}: '{length}' is no time in s") from error
     if not seconds > 0.0:
         raise InputError(f"--window {said}: the time must be above 0 s")
-    return Window(names[name], seconds)  # type: ignore[arg-type]
+    return Window(names[name], seconds)
 
 
 def _kind(file: TestFile, option: str | None, text: str) -> ResponseKind:
     if option is not None and option not in ("receptance", "mobility", "accelerance"):
         raise InputError(f"--kind {option}: known are receptance, mobility and accelerance")
     said = (option or f"{text} {file.facts.get('units', '')}").lower()
-    for kind, words in (("receptance", ("receptance", "compliance", "m/n")), ("mobility", ("mobility",)), ("accelerance", ("accelerance", "inertance"))):  # fmt: skip
+    for kind, words in _KINDS.items():
         if any(w in said for w in words):
-            return kind  # type: ignore[return-value]
+            return kind
     file.notes.append("responses taken as accelerance; --kind receptance or mobility if they are not")
     return "accelerance"
 
@@ -382,14 +392,14 @@ def _responses(file: TestFile, band: Band, *, magnitude: bool) -> tuple[Array, A
     if "response" in file.chosen:
         rest = file.pick("response", rest)
     complex_ones = [s for s in rest if np.iscomplexobj(s.values)]
-    columns: list[tuple[str, Array | ComplexArray]] = [(s.name, s.values) for s in complex_ones] or _paired(
-        file, rest
-    )
+    columns: list[tuple[str, NDArray[Any]]] = [(s.name, s.values) for s in complex_ones]
+    columns = columns or _paired(rest)
     if not columns and magnitude:
         columns = [(s.name, _linear(s)) for s in rest if "phase" not in s.words and "std" not in s.words][:1]
     if not columns:
         raise file.error(
-            "no complex response: expected a complex array, or columns with real and imaginary part, or magnitude and phase"
+            "no complex response: expected a complex array, or columns with real and imaginary part, "
+            "or magnitude and phase"
         )
     h = np.column_stack([c for _, c in columns])
     ok = np.isfinite(f) & np.all(np.isfinite(h), axis=1) & (f > 0.0)
@@ -431,9 +441,10 @@ _REAL, _IMAG = ("real", "re"), ("imag", "imaginary", "im")
 _SIZE, _TURN = ("mag", "magnitude", "abs", "amplitude", "gain", "db"), ("phase", "angle", "arg", "deg", "rad")
 
 
-def _paired(file: TestFile, rest: list[Series]) -> list[tuple[str, ComplexArray]]:
+def _paired(rest: list[Series]) -> list[tuple[str, NDArray[Any]]]:
     """Complex responses from columns in pairs."""
-    first = {role: [s for s in rest if any(w in names for w in s.words)] for role, names in (("re", _REAL), ("im", _IMAG), ("size", _SIZE), ("turn", _TURN))}  # fmt: skip
+    kinds = {"re": _REAL, "im": _IMAG, "size": _SIZE, "turn": _TURN}
+    first = {role: [s for s in rest if any(w in names for w in s.words)] for role, names in kinds.items()}
     if first["re"] and len(first["re"]) == len(first["im"]):
         pairs = zip(first["re"], first["im"], strict=True)
         return [(a.name, a.values + 1j * np.asarray(b.values)) for a, b in pairs]
