@@ -23,6 +23,9 @@ INSIDE = 1e-5
 LATE_MARGIN = 0.05
 """Distance from -1 that is designed for with the further delay in the loop."""
 
+NEXT_TO_LIMIT = 1e-3
+"""Nothing better is sought this near to the physical limit, as a share of it and of the passive motion."""
+
 TIGHTENINGS = 5
 FAILED = 1e-4
 
@@ -97,12 +100,14 @@ class Designer:
         kind: BudgetKind | None,
     ) -> Design:
         conditions, unit = self._conditions(situation, cutoffs_hz, demands, kind)
+        left = abs(situation.paths.motion[0] * wish_a + situation.paths.motion[1]) / unit
+        enough = 0.0 if kind is not None else left**2 * (1.0 + 2.0 * NEXT_TO_LIMIT) + NEXT_TO_LIMIT**2
         terms = situation.design_terms(cutoffs_hz)
         margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
         first: list[Array] | None = None
         for _ in range(TIGHTENINGS):
             stability = self._stability(situation, cutoffs_hz, demands, terms, margin, late)
-            search = GainSearch(self._scale, self._bounds, conditions, stability, unit)
+            search = GainSearch(self._scale, self._bounds, conditions, stability, unit, enough)
             if first is None:
                 curves = [terms[0], *self._late(situation, terms[0], demands)]
                 first = self._starts(conditions[0], wish_a, curves, margin)

@@ -25,7 +25,7 @@ from tuning.steady import Pair
 from twin.control.schedule import Gains
 from twin.plant.linear import Array, ComplexArray
 
-ITERATIONS = 30
+ITERATIONS = 20
 FEASIBLE = 1e-6
 SETTLED = 1e-5
 TINY = 1e-9
@@ -128,6 +128,8 @@ class GainSearch:
         (3,) typical size of the gains, (3, 2) their bounds, in SI units.
     unit
         What the targets are measured in: their size without control, or their limit.
+    enough
+        Objective that is as good as any: the search ends there.
     """
 
     def __init__(
@@ -137,6 +139,7 @@ class GainSearch:
         conditions: Sequence[Condition],
         stability: Stability,
         unit: float,
+        enough: float = 0.0,
     ) -> None:
         self._scale = scale
         self._bounds = bounds / scale[:, None]
@@ -152,7 +155,7 @@ class GainSearch:
         self._limit_names = [d.name for d in limits]
         self._slope = np.array([d.slope / d.bound for d in limits])
         self._offset = np.array([d.offset / d.bound for d in limits])
-        self._unit = unit**2
+        self._unit, self._enough = unit**2, enough
 
     def run(self, start: Array) -> Found:
         """Search from a start (3,) in SI units."""
@@ -162,6 +165,8 @@ class GainSearch:
         taken = 0
         while taken < ITERATIONS:
             taken += 1
+            if here.broken < FEASIBLE and here.objective - RIDGE * float(y @ y) < self._enough:
+                break
             hessian = _convex(here.hessian, damping)
             step = self._step(hessian, here)
             if step is None:
