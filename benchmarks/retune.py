@@ -11,7 +11,6 @@ from tuning.gains import GainProgram
 from tuning.loop import LoopFacts
 from tuning.retune import Retuner, TuningGoal
 from twin.plant.config import DampingTable
-from twin.plant.linear import Array
 from twin.station.demo import DRIVE_V, demo_programme
 
 WANTED_P99_MS = 30.0
