@@ -5,6 +5,7 @@ blocks at which answers came, all of which are recorded, so that a replay repeat
 """
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,8 @@ from twin.control.schedule import Acknowledgement, Command, Gains, GainSchedule
 from twin.plant.blocks import Block
 from twin.plant.config import Plant
 from twin.station.advice import Answer, Question
-from twin.station.frame import UNCHANGED, Decision, Event
+from twin.station.frame import STANDS, UNCHANGED, Decision, Event
+from twin.station.orders import Order, Ordered
 from twin.station.worker import Arrival, Tuner
 
 COMMAND_LEAD_BLOCKS = 2
@@ -30,6 +32,12 @@ FORGOTTEN_BLOCKS = 20
 
 GROWTH_BLOCKS = 10
 """Growth is measured over so many blocks."""
+
+ORDER_LEAD_BLOCKS = 1
+"""What the operator orders is due sooner: a block."""
+
+STANDING = 60
+"""So many proposals may wait for the operator; the oldest go."""
 
 MAX_AHEAD_HZ = 3.0
 """A jump of the excitation is no sweep: no more of the table than this is retuned ahead of it."""
@@ -57,6 +65,8 @@ class RetuningSettings:
         Keep the gains in use for as long as they are stable.
     only_if_growing_1_s
         And, with that, until the coil's current reference is seen to grow this fast; 0 does not wait for it.
+    approve
+        Proposals stand until the operator accepts them: nothing becomes a command by itself.
     """
 
     every_blocks: int = 5
@@ -64,9 +74,19 @@ class RetuningSettings:
     outdated_ns_m: float = 0.6
     min_change: float = 1e-3
     reversal: float = 4.0
-    longest_step: float = 0.1
+    longest_step: float = 0.5
     only_if_unstable: bool = False
     only_if_growing_1_s: float = 0.0
+    approve: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A proposal that may become a command when the operator accepts it."""
+
+    question: Question
+    proposal: Proposal
+    steps: Mapping[int, Gains]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +123,10 @@ class Retuning:
         Blocks since the gains in use last changed.
     outdated
         Proposals dropped because the model or the schedule had moved on.
+    approve
+        Whether proposals wait for the operator; begins as the settings say and holds once the operator took gains back.
+    standing
+        By number of the question, those that wait.
     """
 
     def __init__(
@@ -119,6 +143,13 @@ class Retuning:
         self.bounds_m = (float("nan"), float("nan"))
         self.outdated = 0
         self.answer: Answer | None = None
+        self.approve = settings.approve
+        self.standing: dict[int, Standing] = {}
+        self._before: list[tuple[GainSchedule, TuningGoal]] = []
+        self._goal_in_use = goal
+        self._ramp: list[GainSchedule] = []
+        self._ramp_length = self._reverting = 0
+        self._in_ramp = False
         self._replaying = recorded is not None
         self._promises: dict[int, Plant] = {}
         self._promised_by: Plant | None = None
@@ -146,6 +177,7 @@ class Retuning:
         for number in block.commands_applied:
             command = self.commands.get(number)
             if command is not None and command.schedule is not None:
+                self._keep_for_reverting(number, command.schedule)
                 self.schedule = command.schedule
                 self.same_for_blocks = 0
                 self._promised_by = self._promises.pop(number, None)
@@ -269,26 +301,138 @@ class Retuning:
         if not verdict:
             steps = {row: gains for row, gains in answer.steps if self._is_worth_it(row, gains)}
             verdict = "" if steps else UNCHANGED
+        if not verdict and (self._on_its_way is not None or self._ramp):
+            verdict = "outdated: the operator's command is on its way"
+        if not verdict and self.approve:
+            self.standing[answer.number] = Standing(question, proposal, steps)
+            for number in list(self.standing)[:-STANDING]:
+                del self.standing[number]
+            verdict = STANDS
         if verdict:
             return Turn(
                 proposal=proposal,
                 decision=Decision(last, False, "automatic", verdict),
                 events=tuple(events),
             )
+        schedule = self.schedule.with_points(steps)
+        command = self._command(block, COMMAND_LEAD_BLOCKS, schedule, question.plant)
+        for row, gains in steps.items():
+            self._last_step[row] = self._step(row, gains)
+        decision = Decision(last, True, "automatic", "verified and better")
+        return Turn(proposal=proposal, decision=decision, command=command, events=tuple(events))
+
+    def order(self, block: Block, order: Order | None, plant: Plant) -> Ordered | None:
+        """Take an order of the operator after a block, or the next step of the last one.
+
+        Parameters
+        ----------
+        plant
+            The plant as identified.
+        """
+        last = block.end_sample - 1
+        if order is None:
+            if not self._ramp or self._on_its_way is not None:
+                return None
+            command = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
+            step = f"step {self._ramp_length - len(self._ramp)} of {self._ramp_length}"
+            return Ordered(None, Decision(last, True, "operator", step), command)
+        command, words = None, ""
+        match order.kind:
+            case "off" | "on":
+                command = self._switch(block, order)
+                words = "emergency: control off" if order.kind == "off" else "control on"
+            case "found":
+                self._forget(order.schedules)
+                words = "the rig began anew with its own gains"
+            case _ if self._on_its_way is not None or self._ramp:
+                words = "refused: another command is on its way; wait for the rig's answer"
+            case "accept":
+                command, words = self._accept(block, order.number, plant)
+            case "schedule" if order.schedules:
+                self._ramp, self._ramp_length = list(order.schedules), len(order.schedules)
+                self.goal = order.goal or self.goal
+                command = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
+                words = "what-if accepted" + (f", step 1 of {self._ramp_length}" if self._ramp else "")
+            case "revert" if self._before:
+                schedule, self.goal = self._before.pop()
+                self.approve = True
+                command = self._command(block, ORDER_LEAD_BLOCKS, schedule, plant)
+                self._reverting = command.command_id
+                words = "back to the gains before"
+            case _:
+                words = "refused: there is nothing to go back to"
+        words += f" ({order.note})" if order.note else ""
+        taken = command is not None or order.kind == "found"
+        return Ordered(order, Decision(last, taken, "operator", words), command)
+
+    def _accept(self, block: Block, number: int, plant: Plant) -> tuple[Command | None, str]:
+        standing = self.standing.get(number)
+        if standing is None:
+            return None, f"refused: proposal {number} no longer stands"
+        verdict = self._outdated(standing.question, standing.proposal, plant)
+        if verdict:
+            return None, f"refused: {verdict}"
+        self.standing.clear()
+        schedule = self.schedule.with_points(dict(standing.steps))
+        for row, gains in standing.steps.items():
+            self._last_step[row] = self._step(row, gains)
+        command = self._command(block, ORDER_LEAD_BLOCKS, schedule, standing.question.plant)
+        return command, f"proposal {number} accepted"
+
+    def _switch(self, block: Block, order: Order) -> Command:
+        off = order.kind == "off"
+        number = order.command_id or self._next_command
+        self._next_command = max(self._next_command, number + 1)
+        lead = 0 if off else ORDER_LEAD_BLOCKS
+        command = Command(
+            command_id=number,
+            apply_at_sample=0 if off else block.end_sample + lead * block.n_samples,
+            control_enabled=not off,
+        )
+        if off:
+            self._ramp, self._on_its_way = [], None  # nothing that was meant for a running controller follows
+        if not self._replaying:
+            self.commands[number] = command
+        return command
+
+    def _forget(self, schedules: tuple[GainSchedule, ...]) -> None:
+        """Begin anew with the rig's own gains."""
+        if schedules:
+            self.schedule = schedules[-1]
+        self.same_for_blocks, self._on_its_way, self._ramp = 0, None, []
+        self._promised_by = None
+        self._promises.clear()
+        self._before.clear()
+        self.standing.clear()
+
+    def _command(self, block: Block, lead_blocks: int, schedule: GainSchedule, promised_by: Plant) -> Command:
         command = Command(
             command_id=self._next_command,
-            apply_at_sample=block.end_sample + COMMAND_LEAD_BLOCKS * block.n_samples,
-            schedule=self.schedule.with_points(steps),
+            apply_at_sample=block.end_sample + lead_blocks * block.n_samples,
+            schedule=schedule,
         )
         self._next_command += 1
         self._on_its_way, self._way_blocks = command.command_id, 0
-        self._promises[command.command_id] = question.plant
-        for row, gains in steps.items():
-            self._last_step[row] = self._step(row, gains)
+        self._promises[command.command_id] = promised_by
         if not self._replaying:
             self.commands[command.command_id] = command
-        decision = Decision(last, True, "automatic", "verified and better")
-        return Turn(proposal=proposal, decision=decision, command=command, events=tuple(events))
+        return command
+
+    @property
+    def next_command(self) -> int:
+        """Number of the command after the last."""
+        return self._next_command
+
+    @property
+    def can_revert(self) -> bool:
+        """Whether there are gains to go back to."""
+        return bool(self._before)
+
+    def _keep_for_reverting(self, number: int, schedule: GainSchedule) -> None:
+        if schedule != self.schedule and number != self._reverting and not self._in_ramp:
+            self._before = [*self._before[-19:], (self.schedule, self._goal_in_use)]
+        self._in_ramp = bool(self._ramp)
+        self._goal_in_use = self.goal
 
     def _outdated(self, question: Question, proposal: Proposal, plant: Plant) -> str:
         """Why a proposal no longer fits; empty if it does."""
