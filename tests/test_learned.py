@@ -12,6 +12,8 @@ from estimators.learned import learned_fingerprint, load_learned, save_learned
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
+from twin.rig.programme import rig_channels
+from twin.station.session import Session, SessionSettings, settings_from
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +102,19 @@ def test_file_that_is_not_there_or_cannot_be_written_says_so(rig: Plant, tmp_pat
         load_learned(tmp_path / "none.json", rig)
     with pytest.raises(InputError, match="cannot be written"):
         save_learned(tmp_path / "no" / "folder" / "c2.json", taught(rig), rig)
+
+
+def test_session_goes_on_from_what_was_learned_and_a_replay_of_it_does_too(rig: Plant) -> None:
+    learner = taught(rig)
+    fresh = Session(rig, rig_channels(rig), 50_000.0, SessionSettings())
+    assert fresh.learner is not None
+    knows = Session(rig, rig_channels(rig), 50_000.0, SessionSettings(learned=learner.state()))
+    again = Session(
+        rig, rig_channels(rig), 50_000.0, settings_from(json.loads(json.dumps(knows.configuration())))
+    )
+    for session in (knows, again):
+        assert session.learner is not None
+        np.testing.assert_array_equal(session.learner.curve().damping_ns_m, learner.curve().damping_ns_m)
+    assert not np.array_equal(fresh.learner.curve().damping_ns_m, learner.curve().damping_ns_m)
+    with pytest.raises(InputError, match="learned before cannot be used"):
+        Session(rig, rig_channels(rig), 50_000.0, SessionSettings(learned={"settings": {}}))

@@ -151,6 +151,13 @@ def demo(
     test: Annotated[
         int, typer.Option(help="Test of the thesis: 3, or 1, whose gains are unstable above 51 Hz.")
     ] = 3,
+    learned: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.json",
+            help="Go on from the damping learned there, if the file exists; kept there in the end.",
+        ),
+    ] = None,
     json_to: JsonOption = None,
 ) -> None:
     """Run a simulated rig in a process of its own with the twin beside it: thesis Test 3, retuned as it runs.
@@ -173,7 +180,7 @@ def demo(
     window = not headless and not web and has_display()
     if test not in (1, 3):
         raise InputError(f"--test {test}: the demo knows tests 1 and 3; the others are among the recordings")
-    options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3)
+    options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3, learned)
     say(
         f"Simulated rig, thesis Test {test}: {SWEEP_HZ[0]:g} to {SWEEP_HZ[1]:g} Hz in {seconds:g} s; "
         f"recording to {recording}"
@@ -409,6 +416,69 @@ def rig(
 
 
 @app.command(
+    epilog="Example: atmd live tcp://127.0.0.1:5555 --plant rig --keys keys/station.key_secret --rig keys/rig.key"
+)
+def live(
+    address: Annotated[
+        str, typer.Argument(metavar="tcp://HOST:PORT", help="The rig's samples.", show_default=False)
+    ],
+    plant: Annotated[str, typer.Option(metavar="PRESET|FILE", help="Model of the rig.", show_default=False)],
+    keys: Annotated[
+        Path, typer.Option(metavar="FILE.key_secret", help="The station's own key.", show_default=False)
+    ],
+    rig: Annotated[Path, typer.Option(metavar="FILE.key", help="The rig's public key.", show_default=False)],
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Recording; runs/live.rrd unless given.")
+    ] = None,
+    web: Annotated[bool, typer.Option(help="Serve the operator page, with Rerun's viewer in it.")] = True,
+    view: Annotated[bool, typer.Option("--view", help="Open Rerun's own viewer.")] = False,
+    bind: Annotated[
+        str, typer.Option(metavar="HOST", help="Address the operator page is served on.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 0,
+    automatic: Annotated[
+        bool,
+        typer.Option("--automatic", help="Send verified proposals at once; else the operator decides."),
+    ] = False,
+    budget_w: Annotated[float, typer.Option(min=1e-3, help="Power the coil may burn, in W.")] = 4.0,
+    budget: Annotated[BudgetName, typer.Option(help="Which power that is.")] = BudgetName.JOULE_MEAN,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="End after so much data, in s; else at Ctrl-C.")
+    ] = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Run the twin beside a rig: watch, learn, propose, and send what the operator accepts, until Ctrl-C.
+
+    Channels, rate and gains come from the rig's own hello. Silence is waited out, a rig that starts again goes on in the
+    same recording. At the end control is off at the rig, since nobody watches it. JSON keys: those of the demo, and
+    lost, late, repeated, reordered, malformed, restarts, clock_drift_ppm, interrupted.
+    """
+    from tuning.retune import TuningGoal
+    from twin.station.live_rig import LiveEnd, LiveOptions, run_live
+
+    _must_be_rrd(save)
+    must_be_writable(json_to)
+
+    def end(_signal: int, _frame: object) -> NoReturn:
+        signal.signal(signal.SIGINT, _interrupt)  # a second one ends what the first did not
+        raise LiveEnd
+
+    options = LiveOptions(
+        address, plant, keys, rig, TuningGoal(budget_w=budget_w, budget_kind=budget.value),
+        save if save is not None else Path("runs") / "live.rrd", web, view, bind, port, automatic, seconds,
+    )  # fmt: skip
+    signal.signal(signal.SIGINT, end)
+    try:
+        result = run_live(options, say)
+    except LiveEnd:
+        raise Interrupted from None
+    report(result, _live_table, json_to)
+    say(f"recording: {options.recording}   replay it with: atmd replay {options.recording}")
+    if "error" in result:
+        raise RunError(f"{result['error']} What was recorded until then is whole: {options.recording}")
+
+
+@app.command(
     epilog="Examples: atmd export runs/demo.rrd --out firmware   ·   "
     "atmd export tuning.json --plant rig --out firmware   ·   atmd export --plant rig --rule thesis --out firmware"
 )
@@ -501,7 +571,8 @@ def whatif(
         typer.Option(metavar="PRESET|FILE", help="A plant as its file has it, with the thesis's gains."),
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="What is different; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="What is different; may be repeated."),
     ] = None,
     band: Annotated[
         str, typer.Option(metavar="FROM:TO:STEP|LIST", help="Excitation frequencies in Hz.")
@@ -561,7 +632,10 @@ def tune(
         float | None, typer.Option(metavar="V", help="Peak at an exciting shaker, in V; 4 unless given.")
     ] = None,
     delay_us: Annotated[
-        float, typer.Option(metavar="US", help="Delay from measuring to the converter, in µs; its hold comes on top.")
+        float,
+        typer.Option(
+            metavar="US", help="Delay from measuring to the converter, in µs; its hold comes on top."
+        ),
     ] = 50.0,
     modulus_margin: Annotated[float, typer.Option(metavar="M", help="Least |1 + L|.")] = 0.3,
     delay_margin_us: Annotated[
@@ -582,7 +656,9 @@ def tune(
         str | None,
         typer.Option(metavar="LP,HP", help="Filter cutoffs in Hz; those of Test 3 or better unless given."),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw motion, power and margins.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw motion, power and margins.")
+    ] = None,
     json_to: JsonOption = None,
 ) -> None:
     """Work out gains for each frequency: as quiet as the power allows, verified, beside what physics allows.
@@ -704,12 +780,28 @@ def _demo_table(r: dict[str, Any]) -> Table:
             f"motion at {audit['displacement_points']}, power at {audit['power_points']} points",
         )
     if instability is not None:
-        table.add_row(
-            "gains unstable from", f"{instability['from_hz']:.1f} Hz", instability["explained"]
-        )
+        table.add_row("gains unstable from", f"{instability['from_hz']:.1f} Hz", instability["explained"])
         ended = instability["removed_by_command"]
-        what = "not removed" if ended is None else f"by command {ended} at {instability['removed_at_hz']:.1f} Hz"
+        what = (
+            "not removed" if ended is None else f"by command {ended} at {instability['removed_at_hz']:.1f} Hz"
+        )
         table.add_row("removed", what, "")
+    return table
+
+
+def _live_table(r: dict[str, Any]) -> Table:
+    table = Table("figure", "value", "", title=f"Live: {r['rig']}", title_justify="left")
+    table.add_row("blocks", f"{r['blocks']}", f"{r['masked_samples']} values masked")
+    wire = ", ".join(f"{r[k]} {k}" for k in ("late", "repeated", "reordered", "malformed"))
+    table.add_row("blocks lost", f"{r['lost']}", wire)
+    table.add_row("rig began anew", f"{r['restarts']} times", "")
+    table.add_row("rig's clock against this one", with_unit(r["clock_drift_ppm"], "ppm"), "")
+    if r["attenuation_mean"] is not None:
+        table.add_row("mean attenuation", percent(r["attenuation_mean"]), "against the model without control")
+    budget = f"budget {r['budget_w']:g} W ({r['budget_kind'].replace('_', ' ')})"
+    table.add_row("mean Joule power", with_unit(r["joule_mean_w"], "W"), f"largest of any block; {budget}")
+    table.add_row("commands", f"{r['commands']}", "")
+    table.add_row("real-time factor", number(r["realtime_factor"]), "time of data / time in the loop")
     return table
 
 

@@ -1,7 +1,6 @@
 """The embedded demonstration: a simulated rig in its own process, the twin beside it, and what came of it."""
 
 import json
-import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -10,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from estimators.learned import load_learned, save_learned
 from tuning.rule import scheduling_rule
 from twin.plant.blocks import Channel, make_block
-from twin.plant.config import DampingTable
-from twin.plant.errors import RunError
+from twin.plant.config import DampingTable, Plant
+from twin.plant.errors import InputError, RunError
 from twin.plant.files import load_plant
 from twin.plant.linear import Array
 from twin.rig.embedded import EmbeddedRig
@@ -42,6 +42,8 @@ class DemoOptions:
         1 keeps real time, 0 goes as fast as the twin follows; None chooses: real time when somebody watches.
     recording
         File to write.
+    learned
+        File to go on from, if it is there, and to keep in the end what was learned.
     """
 
     seconds: float = 60.0
@@ -52,6 +54,7 @@ class DemoOptions:
     web: bool = False
     speed: float | None = None
     test: Literal[1, 3] = 3
+    learned: Path | None = None
 
 
 GROWTH_SEEN_1_S = 0.3
@@ -101,8 +104,9 @@ def session_for(
     goal: "TuningGoal",
     retuning: "RetuningSettings | None" = None,
     tuner: "Tuner | None" = None,
+    learned: dict[str, Any] | None = None,
 ) -> "Session":
-    """Return the twin of a programme: it knows everything of it but the true damping."""
+    """Return the twin of a programme: it knows everything of it but the true damping, unless it learned that before."""
     from twin.station.retuning import RetuningSettings
     from twin.station.session import Session, SessionSettings
 
@@ -111,6 +115,7 @@ def session_for(
         schedule=programme.schedule,
         goal=goal,
         retuning=retuning or RetuningSettings(),
+        learned=learned,
     )
     return Session(programme.plant, channels, programme.sample_rate_hz, settings, tuner=tuner)
 
@@ -147,10 +152,10 @@ def run_demo(
         from tuning.retune import TuningGoal
         from twin.station.outputs import Outputs
         from twin.station.retuning import RetuningSettings
-        from twin.station.summary import RunLog
+        from twin.station.run import Loop
         from twin.station.worker import TunerProcess
 
-        log, in_loop_s, error = RunLog(), 0.0, ""
+        error = ""
         goal, retuning = TuningGoal(budget_w=options.budget_w), RetuningSettings()
         if options.test == 1:
             # One retune for the whole table, and only once the rig shows what the gains do.
@@ -159,7 +164,8 @@ def run_demo(
         # Where the rig does not wait for the twin, the twin does not wait for its tuner either.
         lag = None if speed else retuning.lag_blocks
         tuner = TunerProcess(programme.plant, facts_of(programme), goal, lag)
-        session = session_for(programme, rig.channels, goal, retuning, tuner)
+        learned = _learned_before(options.learned, programme.plant)
+        session = session_for(programme, rig.channels, goal, retuning, tuner, learned)
         setup = describe_run(programme, options)
         with (
             closing(tuner),
@@ -182,21 +188,19 @@ def run_demo(
             session.warm_up()
             rig.connect()
             gateway = rig.gateway
+            loop = Loop(session, outputs, gateway)
+            log = loop.log
             try:
                 for block in rig.blocks():
-                    began = time.perf_counter()
-                    frame = session.advance(block, gateway.acknowledgements())
-                    if frame.command is not None:
-                        gateway.send(frame.command)
-                    gateway.heartbeat(block.end_sample)
-                    outputs.take(frame)
-                    log.add(frame)
-                    in_loop_s += time.perf_counter() - began
+                    loop.turn(block)
                     progress(log.blocks, programme.n_blocks)
             except RunError as failure:
                 error = str(failure)
             outputs.finish()
             gateway.close()
+            if options.learned is not None and session.learner is not None and log.blocks:
+                save_learned(options.learned, session.learner, programme.plant)
+                say(f"what was learned: {options.learned}")
             dropped, unseen = gateway.dropped, outputs.frames_unseen
             passive = passive_displacement(programme, log.blocks)
             result = {
@@ -205,7 +209,7 @@ def run_demo(
                 "budget_kind": goal.budget_kind,
                 "dropped": dropped,
                 "frames_unseen": unseen,
-                "realtime_factor": log.samples / programme.sample_rate_hz / in_loop_s if in_loop_s else None,
+                "realtime_factor": loop.realtime_factor,
                 "seconds": options.seconds,
                 "seed": options.seed,
                 "recording": str(options.recording),
@@ -216,6 +220,15 @@ def run_demo(
             if linger is not None:
                 linger()
             return result
+
+
+def _learned_before(path: Path | None, plant: Plant) -> dict[str, Any] | None:
+    """What a file has of an earlier run; None if there is no file yet."""
+    if path is None or not path.exists():
+        if path is not None and not path.absolute().parent.is_dir():
+            raise InputError(f"--learned {path}: there is no folder {path.absolute().parent}; make it first")
+        return None
+    return load_learned(path, plant).state()
 
 
 def passive_displacement(programme: Programme, n_blocks: int) -> Array:

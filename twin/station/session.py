@@ -29,6 +29,7 @@ from twin.plant.inputs import DriveReader, driven_model
 from twin.plant.parallel import ParallelPlant
 from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, SETTLED_SHARE, AuditPoint, audit_point
 from twin.station.frame import Event, Frame, Performance
+from twin.station.orders import Order
 from twin.station.performance import PerformanceMeter
 from twin.station.retuning import Retuning, RetuningSettings, Turn
 from twin.station.worker import AfterBlocks, Tuner, TunerHere
@@ -60,6 +61,8 @@ class SessionSettings:
         Budget and margin of the tuner.
     learner
         Of the damping curve.
+    learned
+        What was learned before, as `DampingLearner.state` gives it, to go on from; None begins anew.
     retuning
         When gains are asked for and which become commands.
     model_step_ns_m
@@ -70,6 +73,7 @@ class SessionSettings:
     schedule: GainSchedule | None = None
     goal: TuningGoal = field(default_factory=TuningGoal)
     learner: LearnerSettings = field(default_factory=LearnerSettings)
+    learned: dict[str, Any] | None = None
     retuning: RetuningSettings = field(default_factory=RetuningSettings)
     model_step_ns_m: float = 0.02
 
@@ -149,13 +153,18 @@ class Session:
         if reference is None:
             return
         self._tracker = ExcitationTracker(reference, names)
-        self._learner = DampingLearner(self.plant, self.settings.learner)
         settings = self.settings
+        self._learner = _learner(self.plant, settings)
         if settings.loop is not None and tuner is None:
             when = AfterBlocks(settings.retuning.lag_blocks)
             tuner = TunerHere(self.plant, settings.loop, settings.goal, when)
         if tuner is not None and settings.schedule is not None:
             self.retuning = Retuning(settings.schedule, settings.goal, settings.retuning, tuner, recorded)
+
+    @property
+    def learner(self) -> DampingLearner | None:
+        """What learns the damping; None if the plant or its channels do not let it."""
+        return self._learner
 
     @property
     def schedule(self) -> GainSchedule | None:
@@ -184,13 +193,17 @@ class Session:
         if self.retuning is not None:
             self.retuning.warm_up(self.identified_plant())
 
-    def advance(self, block: Block, acknowledgements: tuple[Acknowledgement, ...] = ()) -> Frame:
+    def advance(
+        self, block: Block, acknowledgements: tuple[Acknowledgement, ...] = (), order: Order | None = None
+    ) -> Frame:
         """Take one block through the whole chain.
 
         Parameters
         ----------
         acknowledgements
             What the rig has answered since the last block, for the frame.
+        order
+            The operator's, to take effect after this block.
         """
         events = self._note_changes(block, acknowledgements)
         raw, checked = block, self._check.advance(block)
@@ -206,6 +219,9 @@ class Session:
             moved = phasors.frequency_hz - self._frequency if self._blocks else 0.0
             self._frequency = phasors.frequency_hz
         curve = self._learn(block, phasors, checked.findings, health, events)
+        ordered = None
+        if self.retuning is not None:
+            ordered = self.retuning.order(block, order, self.identified_plant())
         turn = self._retune(block, phasors, moved, curve, health)
         events.extend(turn.events)
         performance = self._performance(block, phasors, estimate)
@@ -228,6 +244,7 @@ class Session:
             asked=turn.asked,
             arrival=turn.arrival,
             audited=audited,
+            ordered=ordered,
         )
 
     def _note_changes(self, block: Block, acknowledgements: tuple[Acknowledgement, ...]) -> list[Event]:
@@ -412,6 +429,7 @@ class Session:
             "goal": asdict(s.goal),
             "schedule": None if s.schedule is None else s.schedule.model_dump(mode="json"),
             "learner": asdict(s.learner),
+            "learned": s.learned,
             "retuning": asdict(s.retuning),
             "model_step_ns_m": s.model_step_ns_m,
         }
@@ -442,6 +460,15 @@ def settings_from(configuration: dict[str, Any]) -> SessionSettings:
         raise InputError(
             f"the recording's configuration cannot be read ({error}); was it made by another version?"
         ) from error
+
+
+def _learner(plant: Plant, settings: SessionSettings) -> DampingLearner:
+    if settings.learned is None:
+        return DampingLearner(plant, settings.learner)
+    try:
+        return DampingLearner.restored(settings.learned, plant)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"what was learned before cannot be used ({error}); begin without it") from error
 
 
 def _nominal_hz(plant: Plant) -> float:
