@@ -1,6 +1,7 @@
 """The station's end of the wire: blocks in, commands out, and what to do when the rig falls silent."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -75,6 +76,8 @@ class RigGateway:
         self._samples = self._context.socket(zmq.SUB)
         self._samples.rcvhwm = 0
         self._commands = self._context.socket(zmq.DEALER)
+        # An emergency stop goes out from another thread than the loop's; a socket stands one at a time.
+        self._lock = threading.Lock()
         for socket, address in ((self._samples, samples_address), (self._commands, commands_address)):
             guard_client(socket, keys, rig_public)
             socket.connect(address)
@@ -109,7 +112,20 @@ class RigGateway:
         """Blocks whose samples are lost."""
         return self.counts.lost
 
-    def connect(self, is_alive: Callable[[], bool] = lambda: True, timeout_s: float | None = None) -> Hello:
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Columns of its blocks, in SI units; RunError before `connect`."""
+        if self._run is None:
+            raise RunError("the rig is not connected")
+        return self._run.channels
+
+    def connect(
+        self,
+        is_alive: Callable[[], bool] = lambda: True,
+        timeout_s: float | None = None,
+        *,
+        start: bool = True,
+    ) -> Hello:
         """Wait until both sockets are through and the rig has said what it is, then let it begin.
 
         Parameters
@@ -118,6 +134,8 @@ class RigGateway:
             Whether there is still somebody to wait for.
         timeout_s
             Give up after so many seconds; `CONNECT_TIMEOUT_S` unless given.
+        start
+            False leaves that to `start`, for a station that has to make itself ready for what the rig is.
 
         Raises
         ------
@@ -140,8 +158,17 @@ class RigGateway:
                     f"the rig sends samples but no hello of protocol version {VERSION} within {timeout_s:.0f} s; "
                     "see docs/protocol.md"
                 )
-        self._send({"type": "start"})
+        if start:
+            self._send({"type": "start"})
         return self._run.hello
+
+    def start(self) -> None:
+        """Let the rig begin; what it has sent while the station made itself ready is left out."""
+        while self._samples.poll(0):
+            topic, *frames = self._samples.recv_multipart()
+            if topic == TOPIC_HELLO:
+                self._greet(frames)
+        self._send({"type": "start"})
 
     def blocks(
         self,
@@ -193,15 +220,14 @@ class RigGateway:
         self._send({"type": "heartbeat", "next_sample": max(0, next_sample - self._offset)})
 
     def send(self, command: Command) -> None:
-        """Send a command; its acknowledgement arrives through `acknowledgements`."""
+        """Send a command, from any thread; its acknowledgement arrives through `acknowledgements`."""
         due = max(0, command.apply_at_sample - self._offset)
         message = command.model_copy(update={"apply_at_sample": due}).model_dump(mode="json")
         self._send({"type": "command", "command": message})
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """What the rig has answered since the last call."""
-        while self._commands.poll(0):
-            frames = self._commands.recv_multipart()
+        while frames := self._answer():
             try:
                 message = decode(frames[0]) if len(frames) == 1 else {}
                 kind = message.pop("type", "")
@@ -229,16 +255,22 @@ class RigGateway:
         """Take leave of the rig and close both sockets."""
         with contextlib.suppress(zmq.ZMQError):
             self._send({"type": "stop"})
-        self._context.destroy(linger=200)
+        with self._lock:
+            self._context.destroy(linger=200)
 
     @property
     def _offset(self) -> int:
         return self._run.offset if self._run is not None else 0
 
+    def _answer(self) -> list[bytes]:
+        with self._lock:
+            return self._commands.recv_multipart() if self._commands.poll(0) else []
+
     def _send(self, message: dict[str, Any]) -> None:
         # A rig that is away and a full queue: heartbeats and commands for then would come too late anyway.
-        with contextlib.suppress(zmq.Again):
-            self._commands.send(encode(message), flags=zmq.NOBLOCK)
+        with self._lock, contextlib.suppress(zmq.Again):
+            if not self._commands.closed:
+                self._commands.send(encode(message), flags=zmq.NOBLOCK)
 
     def _last_heard(self) -> str:
         following = self._run.arrivals.next_sample if self._run is not None else None

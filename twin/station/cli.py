@@ -449,8 +449,8 @@ def live(
 ) -> None:
     """Run the twin beside a rig: watch, learn, propose, and send what the operator accepts, until Ctrl-C.
 
-    Channels, rate and gains come from the rig's own hello. Silence is waited out, a rig that starts again goes on in the
-    same recording. At the end control is off at the rig, since nobody watches it. JSON keys: those of the demo, and
+    Channels, rate and gains come from the rig's own hello. Silence is waited out, a rig that starts again goes on in
+    the same recording. At the end control is off at the rig, since nobody watches it. JSON keys: those of the demo, and
     lost, late, repeated, reordered, malformed, restarts, clock_drift_ppm, interrupted.
     """
     from tuning.retune import TuningGoal

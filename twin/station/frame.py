@@ -13,6 +13,7 @@ from twin.plant.linear import Array
 
 if TYPE_CHECKING:
     from twin.station.audit import AuditPoint
+    from twin.station.orders import Ordered
     from twin.station.worker import Arrival
 
 
@@ -26,7 +27,9 @@ class Event:
 
 
 UNCHANGED = "too small a change"
-"""Reason of a decision that is kept but not worth a person's attention."""
+STANDS = "waits for the operator"
+ROUTINE = (UNCHANGED, STANDS)
+"""Reasons of decisions that are kept but not worth a person's attention."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,8 @@ class Frame:
         Number of the question asked of the tuner after this block, and what was taken of it at this block.
     audited
         What the gains in use were promised to do at an earlier block, beside what they did.
+    ordered
+        What came of the operator's order.
     phasors, curve, performance
         None where the plant has no such part or the block no excitation.
     """
@@ -94,3 +99,16 @@ class Frame:
     asked: int | None = None
     arrival: "Arrival | None" = None
     audited: "AuditPoint | None" = None
+    ordered: "Ordered | None" = None
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """Commands that this block led to."""
+        ordered = None if self.ordered is None else self.ordered.command
+        return tuple(c for c in (ordered, self.command) if c is not None)
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Decisions made after this block."""
+        ordered = None if self.ordered is None else self.ordered.decision
+        return tuple(d for d in (ordered, self.decision) if d is not None)

@@ -139,8 +139,10 @@ class Outputs:
         if recorder is not None:
             recorder.write_block(frame.block)
             sample = frame.block.end_sample - 1
-            if frame.command is not None:
-                recorder.write_command(frame.command)
+            for command in frame.commands:
+                recorder.write_command(command)
+            if frame.ordered is not None and frame.ordered.order is not None:
+                recorder.write_note("orders", sample, frame.ordered.order.model_dump_json())
             for answer in frame.acknowledgements:
                 recorder.write_acknowledgement(answer, sample)
             for event in frame.events:
@@ -152,8 +154,8 @@ class Outputs:
                 recorder.write_note("answers", sample, json.dumps(taken))
             if frame.audited is not None:
                 recorder.write_note("audit", frame.audited.sample, json.dumps(asdict(frame.audited)))
-            if frame.decision is not None:
-                recorder.write_note("decisions", frame.decision.sample, json.dumps(asdict(frame.decision)))
+            for decision in frame.decisions:
+                recorder.write_note("decisions", decision.sample, json.dumps(asdict(decision)))
         if self._file_view is not None:
             self._file_view.show(frame)
         if self.live is not None:

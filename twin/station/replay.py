@@ -3,7 +3,6 @@
 import itertools
 import json
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,10 +16,11 @@ from twin.plant.errors import InputError
 from twin.plant.files import load_plant
 from twin.rig.foreign import open_foreign
 from twin.rig.recorded import open_recording
+from twin.station.orders import Order
 from twin.station.outputs import Outputs
 from twin.station.prediction import PredictionScore
+from twin.station.run import Loop
 from twin.station.session import Session, SessionSettings, settings_from
-from twin.station.summary import RunLog
 from twin.station.worker import AsRecorded, TunerHere, as_recorded
 
 DISTURBANCE_SAMPLES = 50_000
@@ -67,6 +67,7 @@ class Opened:
     seed: int | None
     config_json: str
     timing: AsRecorded | None = None
+    orders: tuple[tuple[int, Order], ...] = ()
 
     def session(self) -> Session:
         """Return a fresh session for the recording, which repeats what the run's own decided."""
@@ -116,7 +117,6 @@ def run_replay(
         opened.plant, opened.channels, opened.sample_rate_hz, session.observer.sources, opened.fitted_rows
     )
     session.warm_up()
-    log, in_loop_s = RunLog(), 0.0
     made: dict[int, Command] = {}
     answers = list(opened.acknowledgements)
     with Outputs(
@@ -130,16 +130,14 @@ def run_replay(
     ) as outputs:
         if outputs.url:
             say(f"open {outputs.url}")
+        loop = Loop(session, outputs)
+        orders = list(opened.orders)
         for block in opened.blocks():
-            began = time.perf_counter()
             due = tuple(a for sample, a in answers if sample < block.end_sample)
             answers = answers[len(due) :]
-            frame = session.advance(block, due)
-            if frame.command is not None:
-                made[frame.command.command_id] = frame.command
-            outputs.take(frame)
-            log.add(frame)
-            in_loop_s += time.perf_counter() - began
+            order = orders.pop(0)[1] if orders and orders[0][0] < block.end_sample else None
+            frame = loop.turn(block, due, order)
+            made.update({c.command_id: c for c in frame.commands})
             score.add(block, frame.estimate)
             progress(block.end_sample, opened.n_samples)
         outputs.finish()
@@ -147,7 +145,7 @@ def run_replay(
             linger()
     scores = score.scores()
     return {
-        **log.figures(),
+        **loop.log.figures(),
         "file": str(path),
         "plant": opened.plant.name,
         "sample_rate_hz": opened.sample_rate_hz,
@@ -156,7 +154,7 @@ def run_replay(
         "sensors": [asdict(s) for s in scores],
         "fitted_rows_left_out": [list(rows) for rows in opened.fitted_rows],
         "decisions_repeated": None if opened.commands is None else made == opened.commands,
-        "realtime_factor": log.samples / opened.sample_rate_hz / in_loop_s if in_loop_s else None,
+        "realtime_factor": loop.realtime_factor,
         "remarks": list(opened.remarks),
         "recording": str(options.recording) if options.recording is not None else None,
     }
@@ -210,6 +208,7 @@ def _open_own(path: Path, options: ReplayOptions) -> Opened:
         seed=recording.seed,
         config_json=recording.run_config_json,
         timing=as_recorded(recording.notes("questions"), recording.notes("answers")),
+        orders=tuple((s, Order.model_validate_json(text)) for s, text in recording.notes("orders")),
     )
 
 

@@ -18,7 +18,7 @@ from twin.station import palette
 from twin.station.blueprint import Layout, blueprint
 from twin.station.columns import TIMELINE, Columns, nanoseconds
 from twin.station.curve_plot import Axes, axes_for, log_axes, log_curve
-from twin.station.frame import UNCHANGED, Frame
+from twin.station.frame import ROUTINE, Frame
 
 SHOWN_HZ = 1000.0
 _CURVE_PERIOD_S = 0.5
@@ -196,8 +196,7 @@ class RerunView:
         log_curve(self._stream, curve, axes, hz)
 
     def _show_gains(self, frame: Frame, end: Array) -> None:
-        if frame.command is not None:
-            self._sent[frame.command.command_id] = frame.command
+        self._sent.update({command.command_id: command for command in frame.commands})
         for answer in frame.acknowledgements:
             command = self._sent.pop(answer.command_id, None)
             if answer.accepted and command is not None and command.schedule is not None:
@@ -227,10 +226,11 @@ class RerunView:
             self._say(
                 event.sample / rate, event.text, {"warning": "WARN"}.get(event.level, event.level.upper())
             )
-        if frame.decision is not None and frame.decision.reason != UNCHANGED:
-            d = frame.decision
-            word = "accepted" if d.accepted else "declined"
-            self._say(d.sample / rate, f"proposal {word} ({d.by}): {d.reason}", "INFO")
+        for d in frame.decisions:
+            if d.reason not in ROUTINE:
+                what = "order" if d.by == "operator" else "proposal"
+                word = "accepted" if d.accepted else "declined"
+                self._say(d.sample / rate, f"{what} {word} ({d.by}): {d.reason}", "INFO")
         for answer in frame.acknowledgements:
             text = f"rig: command {answer.command_id} " + ("applied" if answer.accepted else "refused")
             reason = f": {answer.reason}" if answer.reason else ""

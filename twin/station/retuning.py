@@ -4,6 +4,7 @@ Questions go to a `Tuner`; here is only compared and counted. What is decided de
 blocks at which answers came, all of which are recorded, so that a replay repeats it.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -182,6 +183,8 @@ class Retuning:
                 self.same_for_blocks = 0
                 self._promised_by = self._promises.pop(number, None)
         known = self._on_its_way
+        if known in refused:
+            self._ramp = []
         if known in refused or known in block.commands_applied or self._way_blocks > FORGOTTEN_BLOCKS:
             self._on_its_way = None
 
@@ -333,10 +336,11 @@ class Retuning:
         if order is None:
             if not self._ramp or self._on_its_way is not None:
                 return None
-            command = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
+            further = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
             step = f"step {self._ramp_length - len(self._ramp)} of {self._ramp_length}"
-            return Ordered(None, Decision(last, True, "operator", step), command)
-        command, words = None, ""
+            return Ordered(None, Decision(last, True, "operator", step), further)
+        command: Command | None = None
+        words = ""
         match order.kind:
             case "off" | "on":
                 command = self._switch(block, order)
@@ -472,10 +476,14 @@ class Retuning:
 
     def _step(self, row: int, gains: Gains) -> tuple[float, ...]:
         """Change of the law's terms and cutoffs at a point of the table, as shares of the largest there."""
-        f = self.schedule.frequency_hz
-        now = self.schedule.at(f[row])
-        largest = max(abs(t) for hz in f for t in stiffness_terms(self.schedule.at(hz), hz)) or 1.0
-        pairs = zip(stiffness_terms(now, f[row]), stiffness_terms(gains, f[row]), strict=True)
-        terms = [(new - old) / largest for old, new in pairs]
-        cutoffs = [gains.low_pass_hz / now.low_pass_hz - 1.0, gains.high_pass_hz / now.high_pass_hz - 1.0]
+        s = self.schedule
+        w = math.tau * np.array(s.frequency_hz)
+        table = np.stack([np.array(s.alpha_kg) * w**2, np.array(s.beta_ns_m) * w, np.array(s.gamma_n_m)])
+        largest = float(np.abs(table).max()) or 1.0
+        new = stiffness_terms(gains, s.frequency_hz[row])
+        terms = [(after - float(before)) / largest for before, after in zip(table[:, row], new, strict=True)]
+        cutoffs = [
+            gains.low_pass_hz / s.low_pass_hz[row] - 1.0,
+            gains.high_pass_hz / s.high_pass_hz[row] - 1.0,
+        ]
         return (*terms, *cutoffs)

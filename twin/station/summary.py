@@ -50,7 +50,7 @@ class RunLog:
         self.samples += block.n_samples
         valid = frame.checked.block.valid
         self.masked += valid.size - int(valid.sum())
-        self.commands += frame.command is not None
+        self.commands += len(frame.commands)
         if frame.decision is not None and frame.decision.reason.startswith("outdated"):
             self.outdated += 1
         self.instability.add(frame)
