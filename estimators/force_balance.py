@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.balance_noise import BalanceNoise
-from estimators.moments import moments
+from estimators.moments import MOST_DERIVATIVES, moments
 from estimators.types import Phasors
 from twin.plant.config import MOTION_UNITS, Plant
 from twin.plant.linear import Array, ComplexArray, read_only
@@ -87,6 +87,9 @@ class AbsorberBalance:
         self._orders = np.array([order for _, order, _ in motions])
         self._geometry = np.array([weights for _, _, weights in motions])
         self._balance_noise = BalanceNoise(len(motions) + 1)
+        sensors = {s.name: s for s in plant.sensor}
+        self._stages = [sensors[channels[column]].input_stage for column in self._columns]
+        self._has_stages = any(stage(1j) != 1.0 for stage in self._stages)
 
     def solve(self, phasors: Phasors) -> ForceBalance:
         """Damping and stiffness of one block."""
@@ -120,13 +123,16 @@ class AbsorberBalance:
 
     def _tests(self, phasors: Phasors, share: Array) -> list["_Test"]:
         """The balance against each test function of a block."""
+        highest = 2 + int(self._orders.max())
         found = moments(
             phasors.samples[:, self._columns],
             phasors.duration_s,
             phasors.frequency_hz,
-            2 + int(self._orders.max()),
+            min(highest + self._has_stages, MOST_DERIVATIVES),
         )
         full, grams = found.against_derivatives, found.gram
+        if self._has_stages:
+            full = self._before_input_stages(full, math.tau * found.frequency_hz)
         # <a, psi^(m)> = (-1)^n <y, psi^(m+n)> for y that lacks n derivatives, m = 0, 1, 2.
         rows, motions = np.arange(3)[:, None] + self._orders, np.arange(len(self._orders))
         accelerations = ((-1.0) ** self._orders * full[:, rows, motions]) @ share.T
@@ -145,6 +151,25 @@ class AbsorberBalance:
             )
             for k in range(len(full))
         ]
+
+    def _before_input_stages(self, full: ComplexArray, w: Array) -> ComplexArray:
+        """Moments of what the sensors felt, from those of what was recorded behind their input stages.
+
+        With ``1/S(s)`` to first order about ``j w``, S the stage: ``x = C y + C' (y' - j w y)``, and a derivative
+        of y is one of the test function with the other sign. Exact at steady state, and of first order while
+        amplitudes move.
+        """
+        out = full.copy()
+        for k, omega in enumerate(w):
+            for c, stage in enumerate(self._stages):
+                s, step = 1j * omega, 1e-4j * omega
+                if stage(s) == 1.0:
+                    continue
+                inverse = 1.0 / stage(s)
+                slope = (1.0 / stage(s + step) - 1.0 / stage(s - step)) / (2.0 * step)
+                out[k, :, c] *= inverse
+                out[k, :-1, c] += slope * (-full[k, 1:, c] - s * full[k, :-1, c])
+        return out
 
     def _relative(self, phasors: Phasors, share: Array) -> float:
         """|A'/A| of the relative motion [1/s]."""

@@ -17,7 +17,7 @@ from twin.control.chain import CHAIN_STATES, chain_matrices, chain_response
 from twin.control.schedule import Gains
 from twin.plant.config import Plant, Shaker
 from twin.plant.discrete import DiscreteModel, discretise
-from twin.plant.linear import Array, ComplexArray, linear_model
+from twin.plant.linear import Array, ComplexArray, LinearModel, linear_model
 
 WELL_CONDITIONED = 1e9
 """Eigenvectors worse than this are not trusted for responses; the state equation is then solved point by point."""
@@ -125,8 +125,9 @@ class RigModel:
                 continue  # the ground stands still
             rows[1, x[name]] = sign
             weight = 1.0 if facts.relative or name == second else 0.0
-            rows[2] += sign * weight * model.A[n + x[name]]
-            feed[2] += sign * weight * model.B[n + x[name]]
+            of_state, of_input = _accelerometer(plant, model, name, n + x[name])
+            rows[2] += sign * weight * of_state
+            feed[2] += sign * weight * of_input
         rows[3, model.states.index(f"i_{coil.name}")] = 1.0
         self._rows, self._feed = rows, feed
         self._early, self._late = self._held(model.A, model.B[:, self.coil_input])
@@ -305,6 +306,15 @@ class RigModel:
         rates = np.log(decays[np.abs(decays.imag) > 1e-12 * np.abs(decays)]) * self.facts.sample_rate_hz
         rates = rates[rates.imag > 0.0]
         return np.column_stack([rates.imag, np.abs(rates.real)]) / math.tau
+
+
+def _accelerometer(plant: Plant, model: LinearModel, body: str, row: int) -> tuple[Array, Array]:
+    """What the law gets of a body's acceleration: through its sensor's input stage, where one is stated."""
+    for sensor in plant.sensor:
+        if sensor.kind == "acceleration" and sensor.of == body and sensor.input_stage(1j) != 1.0:
+            output = model.outputs.index(sensor.name)
+            return model.C[output], model.D[output]
+    return model.A[row], model.B[row]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ not positive or not finite, bodies attached to nothing or to each other in a rin
 
 import hashlib
 import json
+import math
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
@@ -196,8 +197,9 @@ OneOrPair = Annotated[
 class Sensor(Frozen):
     """A measured channel. ``noise_density`` is one-sided, in the sensor's SI unit per sqrt(Hz).
 
-    A motion ``of`` two bodies is that of the first against the second. ``ac_coupled_hz`` is the corner of a
-    first-order high-pass in the acquisition's input stage [Hz]; None where constant values pass.
+    A motion ``of`` two bodies is that of the first against the second. The acquisition's input stage may have
+    ``bandwidth_hz``, the corner of a first-order low-pass [Hz], and ``ac_coupled_hz``, that of a first-order high-pass
+    behind it; None where everything passes.
     ``recorded_as`` names it in foreign recordings: ``"y:mm"`` for an array y in mm.
     """
 
@@ -206,16 +208,21 @@ class Sensor(Frozen):
     of: OneOrPair
     noise_density: Positive
     range: Positive | None = None
+    bandwidth_hz: Positive | None = None
     ac_coupled_hz: Positive | None = None
     recorded_as: RecordedAs | None = None
 
     @model_serializer(mode="wrap")
-    def _leave_out_no_coupling(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Plants without it keep the fingerprints under which recordings and learned curves know them.
+    def _leave_out_no_input_stage(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Plants without one keep the fingerprints under which recordings and learned curves know them.
         data: dict[str, Any] = handler(self)
-        if self.ac_coupled_hz is None:
-            data.pop("ac_coupled_hz", None)
-        return data
+        return {k: v for k, v in data.items() if v is not None or k not in ("bandwidth_hz", "ac_coupled_hz")}
+
+    def input_stage(self, s: complex) -> complex:
+        """Response of the acquisition's input stage at a complex frequency [rad/s]; 1 where everything passes."""
+        low = 1.0 if self.bandwidth_hz is None else 1.0 / (1.0 + s / (2.0 * math.pi * self.bandwidth_hz))
+        high = 1.0 if self.ac_coupled_hz is None else s / (s + 2.0 * math.pi * self.ac_coupled_hz)
+        return complex(low * high)
 
     @property
     def unit(self) -> str:

@@ -151,12 +151,12 @@ def linear_model(
     )
     C_y = np.reshape(rows_c, (len(kept), size))
     D_y = np.reshape(rows_d, (len(kept), len(plant.actuator)))
-    coupled = {
-        s.name: s.ac_coupled_hz for s in plant.sensor if s.ac_coupled_hz is not None and s.name in kept
-    }
-    if coupled:
-        A, B, C_y = _couple(A, B, C_y, D_y, {kept.index(name): hz for name, hz in coupled.items()})
-        states += tuple(f"h_{name}" for name in coupled)
+    for prefix, key in (("l_", "bandwidth_hz"), ("h_", "ac_coupled_hz")):
+        corners = {s.name: getattr(s, key) for s in plant.sensor if getattr(s, key) and s.name in kept}
+        if corners:
+            rows = {kept.index(name): hz for name, hz in corners.items()}
+            A, B, C_y, D_y = _input_stage(A, B, C_y, D_y, rows, low_pass=prefix == "l_")
+            states += tuple(f"{prefix}{name}" for name in corners)
     return LinearModel(
         A=read_only(A),
         B=read_only(B),
@@ -228,18 +228,20 @@ def _circuit(
     B[row, column] = (kp or 1.0) / coil.inductance_h
 
 
-def _couple(
-    A: Array, B: Array, C: Array, D: Array, corners_hz: Mapping[int, float]
-) -> tuple[Array, Array, Array]:
-    """Append ``h' = w (y - h)`` for some outputs, which then show ``y - h``: a high-pass of first order each."""
+def _input_stage(
+    A: Array, B: Array, C: Array, D: Array, corners_hz: Mapping[int, float], *, low_pass: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Append ``h' = w (y - h)`` for some outputs, which then show h (a low-pass) or ``y - h`` (a high-pass)."""
     n, more = len(A), len(corners_hz)
     A, C = np.pad(A, ((0, more), (0, more))), np.pad(C, ((0, 0), (0, more)))
-    B = np.pad(B, ((0, more), (0, 0)))
+    B, D = np.pad(B, ((0, more), (0, 0))), D.copy()
     for column, (row, corner_hz) in enumerate(corners_hz.items(), start=n):
         w = 2.0 * np.pi * corner_hz
         A[column, :n], A[column, column], B[column] = w * C[row, :n], -w, w * D[row]
-        C[row, column] = -1.0
-    return A, B, C
+        if low_pass:
+            C[row], D[row] = 0.0, 0.0
+        C[row, column] = 1.0 if low_pass else -1.0
+    return A, B, C, D
 
 
 def _sensor_row(
