@@ -75,7 +75,7 @@ class RetuningSettings:
     outdated_ns_m: float = 0.6
     min_change: float = 1e-3
     reversal: float = 4.0
-    longest_step: float = 0.5
+    longest_step: float = 0.2
     only_if_unstable: bool = False
     only_if_growing_1_s: float = 0.0
     approve: bool = False

@@ -96,6 +96,9 @@ def run_whatif(options: WhatIfOptions, say: Callable[[str], None]) -> dict[str, 
     )
     curves = what_if.curves(band, changes)
     traces = _branches(known, changes, curves, options.branch_s) if options.at_s is not None else ()
+    for point in curves.points:
+        if point.reason:
+            say(f"nothing proposed: {point.reason}")
     measured = measured_displacement(known, TRACE_STEP)
     result: dict[str, Any] = {
         "source": known.source,
@@ -192,26 +195,17 @@ def _branch(trace: BranchTrace, measured: tuple[np.ndarray, np.ndarray]) -> dict
 
 def whatif_table(r: dict[str, Any]) -> Table:
     """Table for people: displacements in µm, powers as mean Joule power."""
-    title = f"What if: {', '.join(r['changes']) or 'as it is'}   ({r['source']})"
+    changes = ", ".join(r["changes"]) or "as it is"
+    title = f"What if: {changes} ({r['source']})\nmotion in µm, c2 in Ns/m; power and margin are the proposed gains'"
     table = Table(title=title, title_justify="left")
-    columns = (
-        "f [Hz]",
-        "c2 [Ns/m]",
-        "passive [µm]",
-        "in use",
-        "proposed",
-        "limit",
-        "power [W]",
-        "margin",
-        "",
-    )
+    columns = ("Hz", "c2", "passive", "in use", "proposed", "limit", "W", "margin", "")
     for name in columns:
         table.add_column(name, justify="left" if not name else "right")
     for p in r["points"]:
         used, new = p["in_use"], p["proposed"]
         remark = "in use: unstable" if not used["stable"] else ""
         if new is None:
-            remark = p["reason"] or remark
+            remark = "nothing proposed"
         elif not new["control_on"]:
             remark = "control off"
         table.add_row(

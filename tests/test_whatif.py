@@ -1,0 +1,314 @@
+"""What-if: curves that obey their changes, branches that come true within what they say of themselves."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.test_cli import atmd
+from tuning.branch import Brancher, _over
+from tuning.changes import KEYS, Changes, parse_changes
+from tuning.retune import Retuner, TuningGoal
+from tuning.stability import StabilityWatch
+from tuning.whatif import Curves, WhatIf
+from twin.plant.blocks import make_block
+from twin.plant.errors import InputError
+from twin.rig.simulated import SimulatedRig
+from twin.rig.tests_of_chapter_7 import programme
+from twin.station.demo import demo_programme, facts_of, session_for
+from twin.station.frame import Frame
+from twin.station.instant import instant_at
+from twin.station.whatif import WhatIfOptions, coil_of, run_whatif
+
+TEST_1, TEST_3 = programme("test1"), programme("test3")
+FACTS = facts_of(TEST_3)
+TEST_3_RECORDING = Path(__file__).parents[1] / "recordings" / "test3" / "recording.rrd"
+BAND = [46.0, 49.0, 52.0, 54.0]
+GOAL = TuningGoal()
+
+
+@pytest.fixture(scope="module")
+def what_if() -> WhatIf:
+    return WhatIf(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+
+
+@pytest.fixture(scope="module")
+def as_is(what_if: WhatIf) -> Curves:
+    return what_if.curves(BAND)
+
+
+def moved(curves: Curves) -> list[float]:
+    return [p.proposed.displacement_m or 0.0 for p in curves.points if p.proposed is not None]
+
+
+def test_nothing_proposed_beats_the_limit_or_is_worse_than_passive(as_is: Curves) -> None:
+    assert len(moved(as_is)) == len(BAND)
+    for p in as_is.points:
+        assert p.proposed is not None
+        assert p.limit_m is not None
+        assert p.proposed.stable
+        assert p.limit_m <= (p.proposed.displacement_m or 0.0) * (1.0 + 1e-6) + 1e-12
+        assert (p.proposed.displacement_m or 0.0) < p.passive_m
+
+
+def test_a_proposal_is_the_tuners_own(as_is: Curves) -> None:
+    goal = TuningGoal(reach_hz=1e-6)
+    tuner = Retuner(TEST_3.true_plant, FACTS, goal)
+    table = Changes().table(TEST_3.schedule, BAND)
+    for p in as_is.points:
+        ((_, point),) = tuner.propose(0, TEST_3.true_plant, 0.05, p.frequency_hz, 4.0, table).points
+        assert p.proposed is not None
+        assert p.proposed.gains == point.gains
+        assert p.limit_m == point.limit_displacement_m
+
+
+def test_a_tight_budget_is_kept_moves_the_proposal_and_leaves_the_gains_in_use(
+    what_if: WhatIf, as_is: Curves
+) -> None:
+    tight = what_if.curves(BAND, Changes(budget_w=0.2))
+    for before, after in zip(as_is.points, tight.points, strict=True):
+        assert after.in_use == before.in_use
+        assert after.passive_m == before.passive_m
+        assert (after.limit_m or 0.0) >= (before.limit_m or 0.0)
+        assert after.proposed is not None
+        assert after.proposed.powers is not None
+        assert after.proposed.powers.joule_mean_w <= 0.2 * 1.001
+    assert sum(moved(tight)) > 1.5 * sum(moved(as_is))
+
+
+def test_peak_budget_is_half_the_mean_one(what_if: WhatIf) -> None:
+    peak = what_if.curves(BAND[:2], Changes(budget_w=0.4, budget_kind="joule_peak"))
+    mean = what_if.curves(BAND[:2], Changes(budget_w=0.2))
+    for a, b in zip(peak.points, mean.points, strict=True):
+        assert a.limit_m == pytest.approx(b.limit_m, rel=1e-6)
+
+
+def test_a_price_on_power_buys_less_of_it(what_if: WhatIf, as_is: Curves) -> None:
+    dear = what_if.curves(BAND, Changes(power_price_um_w=200.0))
+    spent = [
+        (d.proposed.powers.joule_mean_w, c.proposed.powers.joule_mean_w)
+        for c, d in zip(as_is.points, dear.points, strict=True)
+        if c.proposed and c.proposed.powers and d.proposed and d.proposed.powers
+    ]
+    assert len(spent) == len(BAND)
+    assert sum(d for d, _ in spent) < 0.8 * sum(c for _, c in spent)
+    assert [p.limit_m for p in dear.points] == pytest.approx([p.limit_m for p in as_is.points])
+
+
+def test_more_excitation_scales_every_linear_line(what_if: WhatIf, as_is: Curves) -> None:
+    half = what_if.curves(BAND, Changes(excitation=2.0), propose=False)
+    for a, b in zip(as_is.points, half.points, strict=True):
+        assert b.passive_m == pytest.approx(0.5 * a.passive_m)
+        assert b.in_use.displacement_m == pytest.approx(0.5 * (a.in_use.displacement_m or 0.0))
+        assert b.proposed is None
+
+
+def test_coils_resistance_costs_power_and_hardly_moves_what_a_current_loop_drives(
+    what_if: WhatIf, as_is: Curves
+) -> None:
+    hot = what_if.curves(BAND, Changes(resistance_ohm=5.4), propose=False)
+    for a, b in zip(as_is.points, hot.points, strict=True):
+        assert a.in_use.powers is not None
+        assert b.in_use.powers is not None
+        assert b.in_use.powers.joule_mean_w == pytest.approx(2.0 * a.in_use.powers.joule_mean_w, rel=0.1)
+
+
+def test_another_presets_coil_brings_its_constants() -> None:
+    changes = parse_changes(["coil=engine_vcm"], coil_of)
+    plant = changes.plant(TEST_3.plant)
+    assert plant.voice_coil is not None
+    assert (plant.voice_coil.resistance_ohm, plant.voice_coil.force_constant_n_a) == (3.0, 22.2)
+    assert plant.voice_coil.name == "vcm"
+    assert plant.limits == TEST_3.plant.limits
+
+
+def test_control_is_off_outside_its_window(what_if: WhatIf) -> None:
+    narrow = what_if.curves(BAND, Changes(on_from_hz=48.0, on_to_hz=53.0))
+    for p in narrow.points:
+        acts = 48.0 <= p.frequency_hz <= 53.0
+        assert (p.in_use.gains is not None) == acts
+        if not acts:
+            assert p.in_use.displacement_m == pytest.approx(p.passive_m)
+
+
+def test_damping_may_be_given_or_scaled(what_if: WhatIf, as_is: Curves) -> None:
+    scaled = what_if.curves(BAND, Changes(damping_scale=0.5), propose=False)
+    fixed = what_if.curves(BAND, Changes(damping_ns_m=7.0), propose=False)
+    for a, b, c in zip(as_is.points, scaled.points, fixed.points, strict=True):
+        assert b.damping_ns_m == pytest.approx(0.5 * a.damping_ns_m)
+        assert c.damping_ns_m == 7.0
+
+
+def test_gains_of_test_1_show_as_unstable_from_52_hz() -> None:
+    curves = WhatIf(TEST_1.true_plant, FACTS, TEST_1.schedule, GOAL, 4.0).curves(
+        [51.0, 52.0, 55.0], propose=False
+    )
+    assert [p.in_use.stable for p in curves.points] == [True, False, False]
+    assert curves.points[1].in_use.growth_1_s == pytest.approx(1.18, abs=0.02)
+    assert curves.points[2].in_use.growth_1_s == pytest.approx(14.35, abs=0.05)
+    assert curves.points[1].in_use.displacement_m is None
+
+
+def test_instability_is_bracketed_and_explained_by_damping_taken_away() -> None:
+    watch = StabilityWatch(FACTS)
+    found = watch.look(TEST_1.true_plant, TEST_1.schedule, 51.8, 52.6)
+    assert found is not None
+    assert watch.growth_1_s(TEST_1.true_plant, TEST_1.schedule, found.from_hz) > 0.0
+    assert watch.growth_1_s(TEST_1.true_plant, TEST_1.schedule, found.from_hz - 0.02) < 0.0
+    assert (found.to_hz, found.worst_hz) == (55.0, 55.0)
+    # The low-pass's lag at 55 Hz is that of the facts, and gamma sin(lag)/w what it takes besides beta.
+    lag = np.radians(22.82 + 360.0 * 55.0 * 20e-6 - 2 * 1.473)
+    gamma = TEST_1.schedule.at(55.0).gamma_n_m
+    taken = gamma * np.sin(lag) / (2.0 * np.pi * 55.0) + 14.0 * np.cos(lag - np.radians(1.473))
+    assert -found.law_damping_ns_m == pytest.approx(taken, rel=0.05)
+    assert found.law_damping_ns_m + found.damping_ns_m < 0.0
+    assert watch.look(TEST_1.true_plant, TEST_1.schedule, 46.0, 49.0) is None
+    assert watch.look(TEST_3.true_plant, TEST_3.schedule, 45.0, 55.0) is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        (["bogus=2"], r"there is no 'bogus'; known: budget_w \[W\]"),
+        (["budget_w"], "write KEY=VALUE"),
+        (["budget_w=ten"], "'ten' is no number in W"),
+        (["budget_w=1", "budget_w=2"], "given twice"),
+        (["budget_w=-1"], "budget_w must be greater than 0 W"),
+        (["budget_w=nan"], "budget_w must be greater than 0 W"),
+        (["budget_kind=peak"], "must be one of joule_mean, joule_peak"),
+        (["modulus_margin=1.5"], "below 1"),
+        (["damping_ns_m=3", "damping_scale=2"], "either"),
+        (["coil=rig_no_vcm"], "has no voice coil"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_with_what_can(settings: list[str], complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        parse_changes(settings, coil_of)
+
+
+def test_every_key_is_a_change_and_has_a_meaning() -> None:
+    values = {k: "joule_mean" if k == "budget_kind" else "0.5" for k in KEYS if k != "damping_scale"}
+    changes = parse_changes([f"{k}={v}" for k, v in values.items()])
+    assert all(getattr(changes, k) is not None for k in values)
+    assert all(meaning for _, meaning in KEYS.values())
+
+
+def test_noise_over_several_samples_is_that_of_each_in_turn() -> None:
+    rng = np.random.default_rng(0)
+    A, Q = 0.4 * rng.normal(size=(4, 4)), np.diag(rng.uniform(size=4))
+    for samples in (1, 2, 3, 7, 50):
+        whole, noise = np.eye(4), np.zeros((4, 4))
+        for _ in range(samples):
+            whole, noise = A @ whole, A @ noise @ A.T + Q
+        quick = _over(A, Q, samples)
+        np.testing.assert_allclose(quick[0], whole, atol=1e-14)
+        np.testing.assert_allclose(quick[1], noise, rtol=1e-12, atol=1e-15)
+
+
+@pytest.fixture(scope="module")
+def running() -> tuple[object, list[Frame], np.ndarray]:
+    """A rig that sweeps under control, its twin's last frames, and the primary's true motion in the second after."""
+    run = demo_programme(20.0, 7)
+    rig = SimulatedRig(run, keep_truth=True)
+    twin = session_for(run, rig.channels, GOAL)
+    frames: list[Frame] = []
+    while rig.next_sample < 650_000:
+        first = rig.next_sample
+        values, on, answers = rig.next_block()
+        applied = tuple(a.command_id for a in answers)
+        block = make_block(first, 50_000.0, values, rig.channels, control_on=on, commands_applied=applied)
+        frames.append(twin.advance(block))
+        if (command := frames[-1].command) is not None and rig.next_sample < 600_000:
+            rig.accept(command)
+    truth = []
+    for _ in range(10):
+        rig.next_block()
+        truth += [part.states[1:, part.model.states.index("x_table")] for part in rig.truth]
+    return twin, frames, np.concatenate(truth)[49::50]
+
+
+def test_branch_comes_true_within_its_own_standard_deviation(running) -> None:  # type: ignore[no-untyped-def]
+    twin, frames, truth = running
+    plant = twin.identified_plant()
+    instant = instant_at(plant, FACTS, frames[-10:])
+    assert instant.rate_hz_s == pytest.approx(1.0, abs=0.02)
+    brancher = Brancher(plant, FACTS, instant, twin.damping_std_at(instant.frequency_hz))
+    in_use = brancher.run("in use", twin.schedule, 1.0)
+    error = in_use.displacement_m - truth
+    ratio = np.sqrt(np.mean((error / in_use.displacement_std_m) ** 2))
+    assert 0.2 < ratio < 2.0
+    off = brancher.run("passive", None, 1.0)
+    assert np.std(off.displacement_m) > 5.0 * np.std(in_use.displacement_m)
+    assert (
+        off.joule_mean_w < 0.2 * in_use.joule_mean_w
+    )  # the open loop still carries what it induces, no more
+
+
+def test_branch_settles_to_the_curves_steady_state(running) -> None:  # type: ignore[no-untyped-def]
+    twin, frames, _ = running
+    plant = twin.identified_plant()
+    instant = instant_at(plant, FACTS, frames[-10:])
+    still = type(instant)(**{n: getattr(instant, n) for n in instant.__slots__} | {"rate_hz_s": 0.0})
+    trace = Brancher(plant, FACTS, still).run("passive", None, 4.0)
+    curves = WhatIf(plant, FACTS, twin.schedule, GOAL, abs(still.drive)).curves(
+        [still.frequency_hz], propose=False
+    )
+    # The table's own mode at 11 Hz rings on; the excitation's share is told from it by projection.
+    late = trace.displacement_m[-1000:]
+    wave = np.exp(-2j * np.pi * still.frequency_hz * trace.time_s[-1000:])
+    amplitude = 2.0 * abs(np.mean(late * wave * np.hanning(1000))) / np.mean(np.hanning(1000))
+    assert amplitude == pytest.approx(curves.points[0].passive_m, rel=0.02)
+
+
+def test_branch_without_excitation_is_refused(running) -> None:  # type: ignore[no-untyped-def]
+    import dataclasses
+
+    twin, frames, _ = running
+    silent = dataclasses.replace(frames[-1], phasors=None)
+    with pytest.raises(InputError, match="no excitation is tracked"):
+        instant_at(twin.plant, FACTS, [silent])
+
+
+def test_command_answers_for_a_plant_and_for_an_instant_of_a_recording(tmp_path: Path) -> None:
+    done = atmd(
+        "whatif", "--plant", "rig", "--set", "budget_w=1", "--band", "47,53", "--json", "-",
+        "--plot", "w.png", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert [p["frequency_hz"] for p in result["points"]] == [47.0, 53.0]
+    assert result["points"][0]["proposed"]["joule_mean_w"] <= 1.001
+    assert (tmp_path / "w.png").stat().st_size > 10_000
+    done = atmd(
+        "whatif", str(TEST_3_RECORDING), "--at", "2.5", "--band", "50:53:1", "--json", "-", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    branches = {b["name"]: b for b in json.loads(done.stdout)["branches"]}
+    assert set(branches) == {"passive", "in use", "proposed"}
+    assert branches["in use"]["off_measured_rms_m"] < 0.5 * branches["passive"]["off_measured_rms_m"]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (WhatIfOptions(plant="rig", settings=("bogus=1",)), "there is no 'bogus'"),
+        (WhatIfOptions(), "give either a FILE"),
+        (WhatIfOptions(plant="rig", at_s=3.0), "has no instants"),
+        (WhatIfOptions(plant="rig_no_vcm"), "no voice coil"),
+        (WhatIfOptions(plant="rig", band="x"), "--band x"),
+        (WhatIfOptions(plant="rig", band="50,49"), "must rise"),
+        (WhatIfOptions(file=Path("no.npz")), "needs a recording of this program"),
+        (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 4 s"),
+        (WhatIfOptions(file=TEST_3_RECORDING, at_s=2.0, settings=("resistance_ohm=3",)), "another coil"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_with_the_remedy(options: WhatIfOptions, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        run_whatif(options, lambda _: None)
+
+
+def test_command_ends_with_2_for_a_key_that_does_not_exist(tmp_path: Path) -> None:
+    done = atmd("whatif", "--plant", "rig", "--set", "bogus=1", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "there is no 'bogus'" in " ".join(done.stderr.split())
