@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimators.lockin import LockIn, Samples, averaged, colour, lock_in, strongest_hz
 from estimators.types import Phasors
 from twin.plant.blocks import Block
-from twin.plant.config import Plant, Shaker
+from twin.plant.config import Plant
 from twin.plant.linear import Array
 
 MIN_VALID_SHARE = 0.5
@@ -48,19 +48,22 @@ SUDDEN_NOISE = 10.0
 def choose_reference(plant: Plant, channels: Sequence[str]) -> str | None:
     """Channel that tells the excitation's frequency best.
 
-    A shaker's voltage, its command or current (nothing the controller does moves them much), else the primary
-    body's acceleration, velocity or displacement; None if the plant has none of them recorded.
+    An exciting actuator's voltage, its command, force or current: nothing the controller does moves them much. Else a
+    motion of the absorber, which moves most where the primary body is quiet; else of the primary body. None if none
+    of them is recorded.
     """
     for actuator in plant.actuator:
-        if isinstance(actuator, Shaker):
+        if actuator is not plant.voice_coil:
             of_it = {s.kind: s.name for s in plant.sensor if s.of == actuator.name}
-            for name in (of_it.get("voltage"), actuator.name, of_it.get("current")):
+            for name in (of_it.get("voltage"), actuator.name, of_it.get("force"), of_it.get("current")):
                 if name in channels:
                     return name
-    of_primary = {s.kind: s.name for s in plant.sensor if s.of == plant.primary.name}
-    for kind in ("acceleration", "velocity", "displacement"):
-        if of_primary.get(kind) in channels:
-            return of_primary[kind]
+    bodies = (plant.primary,) if plant.absorber is None else (plant.absorber, plant.primary)
+    for body in bodies:
+        of_body = {s.kind: s.name for s in plant.sensor if s.of == body.name}
+        for kind in ("acceleration", "velocity", "displacement"):
+            if of_body.get(kind) in channels:
+                return of_body[kind]
     return None
 
 

@@ -79,6 +79,8 @@ class Frame:
         What the gains in use were promised to do at an earlier block, beside what they did.
     ordered
         What came of the operator's order.
+    force_n
+        Amplitude of the exciting force where nothing measures it, and its standard deviation [N].
     phasors, curve, performance
         None where the plant has no such part or the block no excitation.
     """
@@ -100,6 +102,7 @@ class Frame:
     arrival: "Arrival | None" = None
     audited: "AuditPoint | None" = None
     ordered: "Ordered | None" = None
+    force_n: tuple[float, float] | None = None
 
     @property
     def commands(self) -> tuple[Command, ...]:

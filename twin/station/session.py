@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.augmented import UnknownForce
 from estimators.damping import AbsorberBalance, DampingLearner, ForceBalance, LearnerSettings
 from estimators.excitation import ExcitationTracker, choose_reference
 from estimators.health import Health, HealthMonitor
@@ -23,9 +24,9 @@ from tuning.loop import LoopFacts
 from tuning.retune import TuningGoal
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
 from twin.plant.blocks import Block, Channel
-from twin.plant.config import Plant
+from twin.plant.config import GROUND, ForceActuator, Plant
 from twin.plant.errors import InputError
-from twin.plant.inputs import DriveReader, driven_model
+from twin.plant.inputs import DriveReader, InputSource, choose_inputs, driven_model
 from twin.plant.parallel import ParallelPlant
 from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, SETTLED_SHARE, AuditPoint, audit_point
 from twin.station.frame import Event, Frame, Performance
@@ -42,6 +43,11 @@ UNKNOWN_NS_M = 1.0
 
 REPRIEVE_S = 3.0
 """A model that disagrees this long while the absorber's own force balance closes may be cured by learning."""
+
+FORCE_STEP_HZ = 0.005
+"""The model of an unmeasured force is rebuilt when the excitation has moved this far."""
+
+GRAVITY_M_S2 = 9.81
 
 STIFFNESS_SHARE = 0.005
 """The force balance closes if the stiffness it gives has moved by no more than this share of it."""
@@ -115,11 +121,15 @@ class Session:
         names = tuple(c.name for c in channels)
         self._names = names
         self._frequency = _nominal_hz(plant)
-        try:
-            self.observer = Observer(plant, names, sample_rate_hz, frequency_hz=self._frequency)
-        except ValueError as error:
-            raise InputError(str(error)) from error
-        sources = self.observer.sources
+        sources = choose_inputs(plant, names)
+        self.observer = Observer(
+            plant,
+            names,
+            sample_rate_hz,
+            frequency_hz=self._frequency,
+            sources=sources,
+            unknown_force=_unknown_force(plant, sources, self._frequency),
+        )
         model, discrete = driven_model(plant, sources, sample_rate_hz, self._frequency)
         self._parallel = ParallelPlant(DriveReader(sources, names), model, discrete)
         self._parallel_rows = [model.outputs.index(s) for s in self.observer.sensors]
@@ -218,11 +228,12 @@ class Session:
         if phasors is not None:
             moved = phasors.frequency_hz - self._frequency if self._blocks else 0.0
             self._frequency = phasors.frequency_hz
+        force = self._follow_force(estimate, phasors)
         curve = self._learn(block, phasors, checked.findings, health, events)
         ordered = None
         if self.retuning is not None:
             ordered = self.retuning.order(block, order, self.identified_plant())
-        turn = self._retune(block, phasors, moved, curve, health)
+        turn = self._retune(block, phasors, moved, curve, health, force)
         events.extend(turn.events)
         performance = self._performance(block, phasors, estimate)
         audited = self._audit(turn, block, phasors, performance)
@@ -234,6 +245,7 @@ class Session:
             estimate=estimate,
             health=health,
             phasors=phasors,
+            force_n=force,
             curve=curve,
             performance=performance,
             proposal=turn.proposal,
@@ -346,6 +358,18 @@ class Session:
             return self.plant
         return self.plant.with_damping(absorber.name, self._learner.table())
 
+    def _follow_force(
+        self, estimate: StateEstimate, phasors: Phasors | None
+    ) -> tuple[float, float] | None:
+        """Amplitude of an exciting force that nothing measures, and its standard deviation [N]; None if all is."""
+        unknown = self.observer.unknown_force
+        if unknown is None:
+            return None
+        found = unknown.amplitude(estimate)
+        if phasors is not None and abs(phasors.frequency_hz - unknown.frequency_hz) > FORCE_STEP_HZ:
+            self.observer.set_excitation_frequency(phasors.frequency_hz)
+        return found
+
     def _refresh_model(self) -> None:
         damping = self._damping_now()
         if abs(damping - self._modelled_damping) <= self.settings.model_step_ns_m:
@@ -365,11 +389,14 @@ class Session:
         moved_hz: float,
         curve: DampingCurve | None,
         health: Health,
+        force: tuple[float, float] | None,
     ) -> Turn:
         if self.retuning is None or self._learner is None:
             return Turn()
         amplitude = 0.0
-        if phasors is not None:
+        if phasors is not None and force is not None:
+            amplitude = force[0]
+        elif phasors is not None:
             amplitude = abs(phasors.amplitude[self._names.index(phasors.reference)])
         coil = self.plant.voice_coil
         rms = 0.0
@@ -469,6 +496,22 @@ def _learner(plant: Plant, settings: SessionSettings) -> DampingLearner:
         return DampingLearner.restored(settings.learned, plant)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"what was learned before cannot be used ({error}); begin without it") from error
+
+
+def _unknown_force(
+    plant: Plant, sources: tuple[InputSource, ...], frequency_hz: float
+) -> UnknownForce | None:
+    """The machine's own force where it has an absorber and nothing measures what shakes it."""
+    if plant.absorber is None or plant.voice_coil is None:
+        return None
+    unmeasured = {s.actuator for s in sources if s.channel is None}
+    for actuator in plant.actuator:
+        if isinstance(actuator, ForceActuator) and actuator.name in unmeasured:
+            # About as large as the weight of what it shakes: the filter needs an order of magnitude.
+            weight_n = GRAVITY_M_S2 * sum(body.mass_kg for body in plant.body)
+            body = next(place for place, _ in actuator.pushes if place != GROUND)
+            return UnknownForce(body, frequency_hz, weight_n)
+    return None
 
 
 def _nominal_hz(plant: Plant) -> float:
