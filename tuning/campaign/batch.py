@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import expm
 
-from tuning.campaign.kernel import CHUNK, FIGURES, POWER_WINDOW_BLOCKS, TILE, run_spans
+from tuning.campaign.kernel import FIGURES, INPUTS, MEMORY, POWER_WINDOW_BLOCKS, TILE, rows_of, run_spans, terms_of
 from tuning.loop import LoopFacts
 from twin.control.schedule import GainSchedule
 from twin.plant.config import DampingTable, Plant, VoiceCoil
@@ -175,21 +175,22 @@ def _run_tile(cases: Sequence[Case], lanes: Sequence[_Lane], excitation: Excitat
     n, window = lanes[0].n, POWER_WINDOW_BLOCKS
     guard = np.zeros((window + 3, TILE))
     guard[-1] = -1.0
-    padded = -(-n // CHUNK) * CHUNK
+    terms = terms_of(n)
     state = (
-        np.empty((rows, TILE)), np.zeros((2, padded, TILE)), np.zeros((18, TILE)),
-        np.zeros((int(delays.max()), TILE)), guard, np.zeros(3),
+        np.empty(rows * TILE), np.zeros(terms * TILE), np.zeros(MEMORY), np.zeros((int(delays.max()), TILE)), guard,
+        np.zeros(3),
     )  # fmt: skip
-    figures = np.zeros((len(spans), FIGURES, TILE))
+    figures = np.zeros((len(spans), FIGURES * TILE))
+    coefficients, gains = coefficients.reshape(nodes, -1), gains.reshape(len(spans), 2, -1)
     shape = np.concatenate([[0.0], excitation.samples])
     places = np.array(lanes[0].places, dtype=np.int64)
     for part, noise in _noises(cases, lanes, spans):
         run_spans(
             coefficients, weights[part], gains[part], acts[part], spans[part], shape, noise, constants,
-            places, delays, *state, figures[part], 1.0 / fs, n,
+            places, delays, *state, figures[part], 1.0 / fs, n, terms,
         )  # fmt: skip
     tripped = guard[-1, :width]
-    return figures[:, :, :width], np.where(tripped < 0.0, -1.0, tripped / fs)
+    return figures.reshape(-1, FIGURES, TILE)[:, :, :width], np.where(tripped < 0.0, -1.0, tripped / fs)
 
 
 def _noises(cases: Sequence[Case], lanes: Sequence[_Lane], spans: Array) -> Iterator[tuple[slice, Array]]:
@@ -235,12 +236,14 @@ def _lane(case: Case) -> _Lane:
         model = linear_model(plant, frequency_hz=None, damping_ns_m=own)
         discrete = discretise(model, fs, holds)  # type: ignore[arg-type]
         n, states = len(model.states), model.states
-        padded = -(-n // CHUNK) * CHUNK
-        F, C = np.zeros((n, padded)), np.zeros((2, padded))
-        F[:, :n], C[:, :n] = discrete.F, model.C[sensors]
+        sums, feel = np.zeros((rows_of(n) + 2, terms_of(n))), slice(rows_of(n), None)
         last, present = _held(model.A, model.B[:, drive], discrete.B0[:, drive], facts)
-        into = np.column_stack([last, present, discrete.B0[:, exciter], discrete.B1[:, exciter]])
-        rows.append(np.concatenate([F.ravel(), into.ravel(), C.ravel(), model.D[sensors, exciter]]))
+        sums[:n, :n], sums[feel, :n] = discrete.F, model.C[sensors]
+        sums[:n, n : n + INPUTS] = np.column_stack(
+            [last, present, discrete.B0[:, exciter], discrete.B1[:, exciter]]
+        )
+        sums[feel, n + INPUTS - 1] = model.D[sensors, exciter]
+        rows.append(sums.ravel())
     ends = [plant.sensor[k].range or math.inf for k in pair]
     constants = np.array([
         case.amplitude, case.limit(f"{coil.name}_current_a"), ends[0], 1.0 if facts.relative else 0.0, ends[1],

@@ -3,19 +3,25 @@
 Every number of a case lies in a lane of its own, ``[..., TILE]``, and the innermost loops go over the lanes: the
 compiler makes vector instructions of them. Lanes never mix, and the compiler may not reorder a sum, so that a case
 gives the same bits in whatever company it is computed.
+
+State is kept in flat arrays in which the rows of a tile lie a constant ``TILE`` apart. Only then can the compiler see
+that rows do not overlap; with the rows' distance in a variable it falls back on one case at a time, four times slower.
 """
 
-import math
+import numpy as np
 
 from twin.control.chain import SQRT2
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
 
-TILE = 64
-"""Cases side by side: coefficients and states of a tile stay in the second-level cache."""
+TILE = 72
+"""Cases side by side. Rows a power of two apart would fall on each other in the first-level cache."""
 
-CHUNK = 6
-"""States that one line of the recursion takes in; a plant's states are padded with zeros to whole chunks."""
+CHUNK = 5
+"""Terms of a sum are padded with zeros to whole chunks, at least two of them."""
+
+INPUTS = 4
+"""Beside the states: last and present command of the coil, last and present excitation."""
 
 FIGURES = 8
 (X_PEAK, STROKE_PEAK, CURRENT_PEAK, CURRENT_SQUARES, MOTION_WORK, STORED, SATURATED, CONTROLLED) = range(FIGURES)
@@ -23,6 +29,177 @@ FIGURES = 8
 L/2 (i_end² - i_before²) [J], samples with the reference at its clamp, and whether control acted."""
 
 POWER_WINDOW_BLOCKS = 10
+
+(A_LOW, B_LOW, A_VELOCITY, B_VELOCITY, A_POSITION, B_POSITION, ACCELERATION, COMMAND, ACTING, STROKE, SPEED) = (
+    row * TILE for row in range(11)
+)
+(G_LOW, D_LOW, G_HIGH, D_HIGH, SCALE) = (row * TILE for row in range(11, 16))
+MEMORY = 16 * TILE
+"""Rows of a tile's memory: six states of the filter chain, what is computed on the way, and the chain's coefficients."""
+
+(AMPLITUDE, CLAMP, RANGE_1, WEIGHT_1, RANGE_2, WEIGHT_2, FORCE_CONSTANT, INDUCTANCE, MOST_STROKE, MOST_HEATING) = range(
+    10
+)
+"""Rows of a tile's constants: see `run_spans`."""
+
+
+def rows_of(states: int) -> int:
+    """Sums for the states, which are computed in pairs; those of both accelerometers follow."""
+    return states + states % 2
+
+
+def terms_of(states: int) -> int:
+    """Terms of every sum for a plant of so many states, padding included."""
+    return max(2, -(-(states + INPUTS) // CHUNK)) * CHUNK
+
+
+@kernel
+def _sums(coefficients: Array, z: Array, out: Array, first: int, last: int, terms: int) -> None:
+    """Rows ``first`` to ``last`` of the coefficients times z, lane by lane, two rows for each time z is loaded."""
+    for i in range(first, last, 2):
+        row = coefficients[i * terms * TILE : (i + 1) * terms * TILE]
+        next_row = coefficients[(i + 1) * terms * TILE : (i + 2) * terms * TILE]
+        into = out[i * TILE : (i + 2) * TILE]
+        for c in range(TILE):
+            into[c] = (
+                row[c] * z[c]
+                + row[TILE + c] * z[TILE + c]
+                + row[2 * TILE + c] * z[2 * TILE + c]
+                + row[3 * TILE + c] * z[3 * TILE + c]
+                + row[4 * TILE + c] * z[4 * TILE + c]
+                + row[5 * TILE + c] * z[5 * TILE + c]
+                + row[6 * TILE + c] * z[6 * TILE + c]
+                + row[7 * TILE + c] * z[7 * TILE + c]
+                + row[8 * TILE + c] * z[8 * TILE + c]
+                + row[9 * TILE + c] * z[9 * TILE + c]
+            )
+            into[TILE + c] = (
+                next_row[c] * z[c]
+                + next_row[TILE + c] * z[TILE + c]
+                + next_row[2 * TILE + c] * z[2 * TILE + c]
+                + next_row[3 * TILE + c] * z[3 * TILE + c]
+                + next_row[4 * TILE + c] * z[4 * TILE + c]
+                + next_row[5 * TILE + c] * z[5 * TILE + c]
+                + next_row[6 * TILE + c] * z[6 * TILE + c]
+                + next_row[7 * TILE + c] * z[7 * TILE + c]
+                + next_row[8 * TILE + c] * z[8 * TILE + c]
+                + next_row[9 * TILE + c] * z[9 * TILE + c]
+            )
+        for j in range(2 * CHUNK, terms, CHUNK):
+            more, next_more = row[j * TILE : (j + CHUNK) * TILE], next_row[j * TILE : (j + CHUNK) * TILE]
+            rest = z[j * TILE : (j + CHUNK) * TILE]
+            for c in range(TILE):
+                into[c] += (
+                    more[c] * rest[c]
+                    + more[TILE + c] * rest[TILE + c]
+                    + more[2 * TILE + c] * rest[2 * TILE + c]
+                    + more[3 * TILE + c] * rest[3 * TILE + c]
+                    + more[4 * TILE + c] * rest[4 * TILE + c]
+                )
+                into[TILE + c] += (
+                    next_more[c] * rest[c]
+                    + next_more[TILE + c] * rest[TILE + c]
+                    + next_more[2 * TILE + c] * rest[2 * TILE + c]
+                    + next_more[3 * TILE + c] * rest[3 * TILE + c]
+                    + next_more[4 * TILE + c] * rest[4 * TILE + c]
+                )
+
+
+@kernel
+def _show(sums: Array, noise: Array, limit: Array, weight: Array, memory: Array, first: bool) -> None:
+    """Add what one accelerometer shows to the relative acceleration; no noise where the array has no entries."""
+    if len(noise) > 0:
+        for c in range(TILE):
+            sums[c] += noise[c]
+    if first:
+        for c in range(TILE):
+            memory[ACCELERATION + c] = weight[c] * min(max(sums[c], -limit[c]), limit[c])
+    else:
+        for c in range(TILE):
+            memory[ACCELERATION + c] += weight[c] * min(max(sums[c], -limit[c]), limit[c])
+
+
+@kernel
+def _cutoffs(memory: Array, begin: Array, end: Array, w: float, dt: float) -> None:
+    """Coefficients of the filter chain a share ``w`` of the way through a span."""
+    for c in range(TILE):
+        g_low = begin[3 * TILE + c] + w * (end[3 * TILE + c] - begin[3 * TILE + c])
+        g_high = begin[4 * TILE + c] + w * (end[4 * TILE + c] - begin[4 * TILE + c])
+        memory[G_LOW + c] = g_low
+        memory[D_LOW + c] = 1.0 / (1.0 + g_low * (g_low + SQRT2))
+        memory[G_HIGH + c] = g_high
+        memory[D_HIGH + c] = 1.0 / (1.0 + g_high * (g_high + SQRT2))
+        memory[SCALE + c] = dt / (2.0 * g_high)
+
+
+@kernel
+def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w: float) -> None:
+    """Filter chain, gains and clamp, as `twin.control.chain.chain_step` and `twin.control.rig_block`."""
+    # In stages: a chain of operations that wait for each other is short enough for several lanes to overlap.
+    for c in range(TILE):
+        g_low = memory[G_LOW + c]
+        band = (memory[A_LOW + c] + g_low * (memory[ACCELERATION + c] - memory[B_LOW + c])) * memory[D_LOW + c]
+        a = memory[B_LOW + c] + g_low * band
+        memory[A_LOW + c] = 2.0 * band - memory[A_LOW + c]
+        memory[B_LOW + c] = 2.0 * a - memory[B_LOW + c]
+        memory[ACCELERATION + c] = a
+    for c in range(TILE):
+        g_high = memory[G_HIGH + c]
+        band = (
+            memory[A_VELOCITY + c] + g_high * (memory[ACCELERATION + c] - memory[B_VELOCITY + c])
+        ) * memory[D_HIGH + c]
+        low = memory[B_VELOCITY + c] + g_high * band
+        memory[A_VELOCITY + c] = 2.0 * band - memory[A_VELOCITY + c]
+        memory[B_VELOCITY + c] = 2.0 * low - memory[B_VELOCITY + c]
+        memory[SPEED + c] = memory[SCALE + c] * band
+    for c in range(TILE):
+        g_high = memory[G_HIGH + c]
+        band = (
+            memory[A_POSITION + c] + g_high * (memory[SPEED + c] - memory[B_POSITION + c])
+        ) * memory[D_HIGH + c]
+        low = memory[B_POSITION + c] + g_high * band
+        memory[A_POSITION + c] = 2.0 * band - memory[A_POSITION + c]
+        memory[B_POSITION + c] = 2.0 * low - memory[B_POSITION + c]
+        memory[STROKE + c] = memory[SCALE + c] * band
+    for c in range(TILE):
+        command = (
+            (begin[c] + w * (end[c] - begin[c])) * memory[ACCELERATION + c]
+            + (begin[TILE + c] + w * (end[TILE + c] - begin[TILE + c])) * memory[SPEED + c]
+            + (begin[2 * TILE + c] + w * (end[2 * TILE + c] - begin[2 * TILE + c])) * memory[STROKE + c]
+        )
+        bounded = min(max(command, -clamp[c]), clamp[c])
+        # Gains beyond all measure make inf - inf: what is no number must not reach the converter.
+        bounded = bounded if command == command else 0.0  # noqa: PLR0124
+        memory[COMMAND + c] = bounded if memory[ACTING + c] > 0.0 else 0.0
+        stroke[c] = max(stroke[c], abs(memory[STROKE + c]))
+
+
+@kernel
+def _gather(z: Array, held: Array, memory: Array, figures: Array, places: Array, constants: Array) -> None:
+    """Add a sample to the figures of a span."""
+    x, i = z[places[0] * TILE : (places[0] + 1) * TILE], z[places[5] * TILE : (places[5] + 1) * TILE]
+    end, end_v = z[places[1] * TILE : (places[1] + 1) * TILE], z[places[2] * TILE : (places[2] + 1) * TILE]
+    if places[3] >= 0:
+        base, base_v = z[places[3] * TILE : (places[3] + 1) * TILE], z[places[4] * TILE : (places[4] + 1) * TILE]
+        for c in range(TILE):
+            memory[STROKE + c] = end[c] - base[c]
+        for c in range(TILE):
+            memory[SPEED + c] = end_v[c] - base_v[c]
+    else:
+        for c in range(TILE):
+            memory[STROKE + c] = end[c]
+        for c in range(TILE):
+            memory[SPEED + c] = end_v[c]
+    force = constants[FORCE_CONSTANT]
+    clamp = constants[CLAMP]
+    for c in range(TILE):
+        figures[X_PEAK * TILE + c] = max(figures[X_PEAK * TILE + c], abs(x[c]))
+        figures[STROKE_PEAK * TILE + c] = max(figures[STROKE_PEAK * TILE + c], abs(memory[STROKE + c]))
+        figures[CURRENT_PEAK * TILE + c] = max(figures[CURRENT_PEAK * TILE + c], abs(i[c]))
+        figures[CURRENT_SQUARES * TILE + c] += i[c] * i[c]
+        figures[MOTION_WORK * TILE + c] += force[c] * i[c] * memory[SPEED + c]
+    for c in range(TILE):
+        figures[SATURATED * TILE + c] += 1.0 if abs(held[c]) >= clamp[c] else 0.0
 
 
 @kernel
@@ -38,7 +215,7 @@ def run_spans(
     places: Array,
     delays: Array,
     blended: Array,
-    x: Array,
+    z: Array,
     memory: Array,
     line: Array,
     guard: Array,
@@ -46,19 +223,19 @@ def run_spans(
     figures: Array,
     dt: float,
     n: int,
+    terms: int,
 ) -> None:
     """Run a tile of cases through some spans of the excitation, in place.
 
     Parameters
     ----------
     coefficients
-        (Q, R, TILE) discrete plants at Q values of the absorber's damping, R rows: F (n, padded), then for each
-        state what the last and the present command of the coil and the last and present excitation do (n, 4), then
-        C of both accelerometers (2, padded) and their feed-through of the excitation (2).
+        (Q, (rows_of(n) + 2) * terms * TILE) discrete plants at Q values of the absorber's damping: for each of the n states and
+        both accelerometers its factors of states, last and present command, last and present excitation.
     weights
         (S, Q, TILE) share of each of them in a span.
     gains
-        (S, 2, 5, TILE) alpha/k, beta/k, gamma/k and tan(pi f dt) of both cutoffs at the ends of each span.
+        (S, 2, 5 * TILE) alpha/k, beta/k, gamma/k and tan(pi f dt) of both cutoffs at the ends of each span.
     acts
         (S, TILE) 1 where the schedule acts.
     spans
@@ -76,174 +253,91 @@ def run_spans(
         coil's current.
     delays
         (TILE,) samples between a command and the converter, at least 1.
-    blended, x, memory, line, guard, counters
-        Work and state: (R, TILE), (2, padded, TILE), (18, TILE), (longest delay, TILE),
-        (POWER_WINDOW_BLOCKS + 3, TILE): heating of the latest blocks, then sum of squares and largest filtered
-        stroke of the present block, then the sample at which the rig tripped or -1; (3,) place in the delay line,
-        blocks done, samples of the present block.
+    blended, z, memory, line, guard, counters
+        Work and state: one plant's coefficients; (terms * TILE,) states and inputs; (MEMORY,); (longest delay, TILE);
+        (POWER_WINDOW_BLOCKS + 3, TILE) heating of the latest blocks, sum of squares and largest filtered stroke of the
+        present block, and the sample at which the rig tripped or -1; (3,) place in the delay line, blocks done,
+        samples of the present block.
     figures
-        (S, FIGURES, TILE) receives the figures.
-    n
-        States of the plant.
+        (S, FIGURES * TILE) receives the figures.
+    n, terms
+        States of the plant, and `terms_of` them.
     """
-    padded = x.shape[1]
-    feeds, senses = n * padded, n * padded + 4 * n
-    longest = len(line)
+    longest, window = len(line), POWER_WINDOW_BLOCKS
     origin = int(spans[0, 0])
     head, blocks, in_block = int(counters[0]), int(counters[1]), int(counters[2])
-    primary, second, second_v, first, first_v, current = places
-    window = POWER_WINDOW_BLOCKS
+    current = z[places[5] * TILE : (places[5] + 1) * TILE]
+    last, present = z[n * TILE : (n + 1) * TILE], z[(n + 1) * TILE : (n + 2) * TILE]
+    before, now = z[(n + 2) * TILE : (n + 3) * TILE], z[(n + 3) * TILE : (n + 4) * TILE]
+    rows = n + n % 2
+    sums = np.zeros((rows + 2) * TILE)
+    first_sum, second_sum = sums[rows * TILE : (rows + 1) * TILE], sums[(rows + 1) * TILE :]
+    amplitude, quiet = constants[AMPLITUDE], np.empty(0)
+    heating, stroke, tripped = guard[window], guard[window + 1], guard[window + 2]
     for s in range(len(spans)):
         begin, end = int(spans[s, 0]), int(spans[s, 1])
-        count = end - begin
-        for r in range(len(blended)):
-            for c in range(TILE):
-                blended[r, c] = weights[s, 0, c] * coefficients[0, r, c]
-            for q in range(1, len(coefficients)):
+        for r in range((rows + 2) * terms):
+            into = blended[r * TILE : (r + 1) * TILE]
+            into[:] = 0.0
+            for q in range(len(coefficients)):
+                node = coefficients[q, r * TILE : (r + 1) * TILE]
                 for c in range(TILE):
-                    blended[r, c] += weights[s, q, c] * coefficients[q, r, c]
+                    into[c] += weights[s, q, c] * node[c]
+        out, from_gains, to_gains = figures[s], gains[s, 0], gains[s, 1]
         moving = False
+        for c in range(3 * TILE, 5 * TILE):
+            moving |= from_gains[c] != to_gains[c]
+        out[:] = 0.0
         for c in range(TILE):
-            moving |= gains[s, 0, 3, c] != gains[s, 1, 3, c] or gains[s, 0, 4, c] != gains[s, 1, 4, c]
-            memory[11, c] = acts[s, c] if guard[window + 2, c] < 0.0 else 0.0
-            figures[s, X_PEAK, c] = figures[s, STROKE_PEAK, c] = figures[s, CURRENT_PEAK, c] = 0.0
-            figures[s, CURRENT_SQUARES, c] = figures[s, MOTION_WORK, c] = figures[s, SATURATED, c] = 0.0
-            figures[s, CONTROLLED, c] = memory[11, c]
-            figures[s, STORED, c] = -0.5 * constants[7, c] * x[0, current, c] ** 2
+            memory[ACTING + c] = acts[s, c] if tripped[c] < 0.0 else 0.0
+            out[CONTROLLED * TILE + c] = memory[ACTING + c]
+            out[STORED * TILE + c] = -0.5 * constants[INDUCTANCE, c] * current[c] ** 2
         for k in range(begin, end):
-            w = (k - begin) / count
-            before, now = shape[k], shape[k + 1]
+            w = (k - begin) / (end - begin)
             for c in range(TILE):
-                memory[6, c] = line[head, c]  # computed as many samples ago as the delay is long
-                memory[9, c] = constants[0, c] * before
-                memory[10, c] = constants[0, c] * now
-            for i in range(n):
-                b = feeds + 4 * i
-                f = i * padded
-                for c in range(TILE):
-                    x[1, i, c] = (
-                        blended[f, c] * x[0, 0, c]
-                        + blended[f + 1, c] * x[0, 1, c]
-                        + blended[f + 2, c] * x[0, 2, c]
-                        + blended[f + 3, c] * x[0, 3, c]
-                        + blended[f + 4, c] * x[0, 4, c]
-                        + blended[f + 5, c] * x[0, 5, c]
-                        + blended[b, c] * memory[7, c]
-                        + blended[b + 1, c] * memory[6, c]
-                        + blended[b + 2, c] * memory[9, c]
-                        + blended[b + 3, c] * memory[10, c]
-                    )
-                for j in range(CHUNK, padded, CHUNK):
-                    for c in range(TILE):
-                        x[1, i, c] += (
-                            blended[f + j, c] * x[0, j, c]
-                            + blended[f + j + 1, c] * x[0, j + 1, c]
-                            + blended[f + j + 2, c] * x[0, j + 2, c]
-                            + blended[f + j + 3, c] * x[0, j + 3, c]
-                            + blended[f + j + 4, c] * x[0, j + 4, c]
-                            + blended[f + j + 5, c] * x[0, j + 5, c]
-                        )
-            for i in range(n):
-                for c in range(TILE):
-                    x[0, i, c] = x[1, i, c]
+                present[c] = line[head, c]  # computed as many samples ago as the delay is long
             for c in range(TILE):
-                memory[7, c] = memory[6, c]
-                memory[8, c] = 0.0
-            for sensor in range(2):
-                f, d = senses + sensor * padded, senses + 2 * padded + sensor
-                for c in range(TILE):
-                    memory[16, c] = (
-                        blended[f, c] * x[0, 0, c]
-                        + blended[f + 1, c] * x[0, 1, c]
-                        + blended[f + 2, c] * x[0, 2, c]
-                        + blended[f + 3, c] * x[0, 3, c]
-                        + blended[f + 4, c] * x[0, 4, c]
-                        + blended[f + 5, c] * x[0, 5, c]
-                        + blended[d, c] * memory[10, c]
-                    )
-                for j in range(CHUNK, padded, CHUNK):
-                    for c in range(TILE):
-                        memory[16, c] += (
-                            blended[f + j, c] * x[0, j, c]
-                            + blended[f + j + 1, c] * x[0, j + 1, c]
-                            + blended[f + j + 2, c] * x[0, j + 2, c]
-                            + blended[f + j + 3, c] * x[0, j + 3, c]
-                            + blended[f + j + 4, c] * x[0, j + 4, c]
-                            + blended[f + j + 5, c] * x[0, j + 5, c]
-                        )
-                if len(noise) > 0:
-                    for c in range(TILE):
-                        memory[16, c] += noise[k - origin, sensor, c]
-                for c in range(TILE):
-                    shown = min(max(memory[16, c], -constants[2 + 2 * sensor, c]), constants[2 + 2 * sensor, c])
-                    memory[8, c] += constants[3 + 2 * sensor, c] * shown
-
+                before[c] = amplitude[c] * shape[k]
+            for c in range(TILE):
+                now[c] = amplitude[c] * shape[k + 1]
+            _sums(blended, z, sums, 0, rows, terms)
+            for c in range(n * TILE):
+                z[c] = sums[c]
+            for c in range(TILE):
+                last[c] = present[c]
+            _sums(blended, z, sums, rows, rows + 2, terms)
+            _show(
+                first_sum, noise[k - origin, 0] if len(noise) > 0 else quiet, constants[RANGE_1],
+                constants[WEIGHT_1], memory, True,
+            )  # fmt: skip
+            _show(
+                second_sum, noise[k - origin, 1] if len(noise) > 0 else quiet, constants[RANGE_2],
+                constants[WEIGHT_2], memory, False,
+            )  # fmt: skip
             if moving or k == begin:
-                for c in range(TILE):
-                    g_low = gains[s, 0, 3, c] + w * (gains[s, 1, 3, c] - gains[s, 0, 3, c])
-                    g_high = gains[s, 0, 4, c] + w * (gains[s, 1, 4, c] - gains[s, 0, 4, c])
-                    memory[12, c] = g_low
-                    memory[13, c] = 1.0 / (1.0 + g_low * (g_low + SQRT2))
-                    memory[14, c] = g_high
-                    memory[15, c] = 1.0 / (1.0 + g_high * (g_high + SQRT2))
-                    memory[17, c] = dt / (2.0 * g_high)
+                _cutoffs(memory, from_gains, to_gains, w, dt)
+            _law(memory, from_gains, to_gains, constants[CLAMP], stroke, w)
             for c in range(TILE):
-                g_low, g_high = memory[12, c], memory[14, c]
-                band = (memory[0, c] + g_low * (memory[8, c] - memory[1, c])) * memory[13, c]
-                a = memory[1, c] + g_low * band
-                memory[0, c], memory[1, c] = 2.0 * band - memory[0, c], 2.0 * a - memory[1, c]
-                scale = memory[17, c]
-                band = (memory[2, c] + g_high * (a - memory[3, c])) * memory[15, c]
-                low = memory[3, c] + g_high * band
-                memory[2, c], memory[3, c] = 2.0 * band - memory[2, c], 2.0 * low - memory[3, c]
-                v = scale * band
-                band = (memory[4, c] + g_high * (v - memory[5, c])) * memory[15, c]
-                low = memory[5, c] + g_high * band
-                memory[4, c], memory[5, c] = 2.0 * band - memory[4, c], 2.0 * low - memory[5, c]
-                position = scale * band
-                command = (
-                    (gains[s, 0, 0, c] + w * (gains[s, 1, 0, c] - gains[s, 0, 0, c])) * a
-                    + (gains[s, 0, 1, c] + w * (gains[s, 1, 1, c] - gains[s, 0, 1, c])) * v
-                    + (gains[s, 0, 2, c] + w * (gains[s, 1, 2, c] - gains[s, 0, 2, c])) * position
-                )
-                # Gains beyond all measure make inf - inf: what is no number must not reach the converter.
-                command = 0.0 if math.isnan(command) else min(max(command, -constants[1, c]), constants[1, c])
-                memory[9, c] = command if memory[11, c] > 0.0 else 0.0
-                guard[window + 1, c] = max(guard[window + 1, c], abs(position))
-                guard[window, c] += memory[6, c] * memory[6, c]
+                heating[c] += present[c] * present[c]
             for c in range(TILE):
                 slot = head + delays[c]
-                line[slot if slot < longest else slot - longest, c] = memory[9, c]
+                line[slot if slot < longest else slot - longest, c] = memory[COMMAND + c]
             head = head + 1 if head + 1 < longest else 0
-
-            for c in range(TILE):
-                memory[9, c] = x[0, second, c]
-                memory[10, c] = x[0, second_v, c]
-            if first >= 0:
-                for c in range(TILE):
-                    memory[9, c] -= x[0, first, c]
-                    memory[10, c] -= x[0, first_v, c]
-            for c in range(TILE):
-                i_now = x[0, current, c]
-                figures[s, X_PEAK, c] = max(figures[s, X_PEAK, c], abs(x[0, primary, c]))
-                figures[s, STROKE_PEAK, c] = max(figures[s, STROKE_PEAK, c], abs(memory[9, c]))
-                figures[s, CURRENT_PEAK, c] = max(figures[s, CURRENT_PEAK, c], abs(i_now))
-                figures[s, CURRENT_SQUARES, c] += i_now * i_now
-                figures[s, MOTION_WORK, c] += constants[6, c] * i_now * memory[10, c]
-                figures[s, SATURATED, c] += 1.0 if abs(memory[6, c]) >= constants[1, c] else 0.0
-        in_block += count
+            _gather(z, present, memory, out, places, constants)
+        in_block += end - begin
         for c in range(TILE):
-            figures[s, STORED, c] += 0.5 * constants[7, c] * x[0, current, c] ** 2
+            out[STORED * TILE + c] += 0.5 * constants[INDUCTANCE, c] * current[c] ** 2
         if spans[s, 2] > 0.0:
             kept = min(blocks + 1, window)
             for c in range(TILE):
-                guard[blocks % window, c] = guard[window, c] / in_block
+                guard[blocks % window, c] = heating[c] / in_block
                 total = 0.0
                 for b in range(kept):
                     total += guard[b, c]
-                calm = guard[window + 1, c] <= constants[8, c] and total / kept <= constants[9, c]
-                if not calm and guard[window + 2, c] < 0.0:
-                    guard[window + 2, c] = end
-                guard[window, c] = guard[window + 1, c] = 0.0
+                calm = stroke[c] <= constants[MOST_STROKE, c] and total / kept <= constants[MOST_HEATING, c]
+                if not calm and tripped[c] < 0.0:
+                    tripped[c] = end
+            heating[:] = 0.0
+            stroke[:] = 0.0
             blocks, in_block = blocks + 1, 0
     counters[0], counters[1], counters[2] = head, blocks, in_block
