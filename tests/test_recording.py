@@ -1,11 +1,11 @@
 """What was recorded comes back to the bit, whatever happened to the recorder."""
 
+import contextlib
+import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -19,14 +19,18 @@ from twin.control.schedule import Acknowledgement, Command, GainSchedule
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.errors import InputError, RunError
 from twin.plant.files import load_plant
-from twin.rig.recorded import Recording, open_recording
+from twin.rig.recorded import HELD_BYTES, Recording, open_recording
 from twin.rig.recording import Recorder
+from twin.rig.rrf import Extent, extent
+from twin.rig.storage import Storage, part_path, storage
 
 RATE = 50_000.0
 CHANNELS = (Channel("table_acceleration", "m/s²"), Channel("vcm_current", "A"), Channel("shaker", "V"))
 
 
-def a_recorder(path: Path, channels: tuple[Channel, ...] = CHANNELS) -> Recorder:
+def a_recorder(
+    path: Path, channels: tuple[Channel, ...] = CHANNELS, storage: Storage | None = None
+) -> Recorder:
     return Recorder(
         path,
         plant=load_plant("rig"),
@@ -34,6 +38,8 @@ def a_recorder(path: Path, channels: tuple[Channel, ...] = CHANNELS) -> Recorder
         channels=channels,
         run_config_json='{"run": "µ"}',
         seed=7,
+        storage=storage or Storage(keep_free_bytes=0),
+        software={"program": "test"},
     )
 
 
@@ -110,6 +116,8 @@ def test_the_description_of_the_run_comes_back(tmp_path: Path) -> None:
     assert recording.channels == CHANNELS
     assert recording.run_config_json == '{"run": "µ"}'
     assert recording.seed == 7
+    assert recording.software == {"program": "test"}
+    assert recording.finished
     assert (recording.n_samples, recording.n_blocks, recording.end_sample) == (1500, 3, 1500)
     assert not recording.repaired
 
@@ -173,40 +181,177 @@ def test_another_rate_or_another_channel_is_refused(tmp_path: Path) -> None:
             recorder.write_block(make_block(0, RATE, np.zeros((1, 1)), CHANNELS[:1]))
 
 
-def test_a_killed_recorder_loses_one_block_at_most(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-    script = textwrap.dedent(
-        """
-        import sys, time
-        sys.path.insert(0, sys.argv[2])
-        from pathlib import Path
-        from test_recording import a_block, a_recorder
-        recorder = a_recorder(Path(sys.argv[1]))
-        for k in range(10_000):
-            recorder.write_block(a_block(k * 500))
-            print(k, flush=True)
-            time.sleep(0.01)
-        """
-    )
+KILLS = 100
+WRITER = """
+import os, random, signal, struct, sys, time
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_recording import a_block, a_recorder
+folder, kills = Path(sys.argv[1]), int(sys.argv[3])
+moments = random.Random(20260)
+for k in range(kills):  # imports are done: each writer is a fork of this process, which itself writes nothing
+    told, tell = os.pipe()
+    n = moments.choice((1, 40, 500, 3000))
+    child = os.fork()
+    if child == 0:
+        os.close(told)
+        recorder = a_recorder(folder / f"{k}.rrd")
+        i = 0
+        while True:
+            recorder.write_block(a_block(i * n, n))
+            i += 1
+            os.write(tell, struct.pack("<I", i))
+    os.close(tell)
+    time.sleep(moments.uniform(0.0, 0.12))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    with os.fdopen(told, "rb") as pipe:
+        words = pipe.read()
+    taken = struct.unpack("<I", words[-4:])[0] if words else 0
+    print(k, n, taken, flush=True)
+"""
+
+
+def test_whenever_a_recorder_is_killed_all_but_the_block_in_its_hands_comes_back(tmp_path: Path) -> None:
     here = Path(__file__).parent
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(path), str(here)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    last = -1
-    for line in process.stdout:
-        last = int(line)
-        if last >= 60:
-            os.kill(process.pid, signal.SIGKILL)
-            break
-    rest = process.stdout.read().split()
-    process.stdout.close()
-    process.wait()
-    last = int(rest[-1]) if rest else last
-    read = list(open_recording(path).blocks())
-    assert len(read) >= last  # of last + 1 that were written
-    for k, block in enumerate(read):
-        assert_same_block(a_block(k * 500), block)
+    command = [sys.executable, "-c", WRITER, str(tmp_path), str(here), str(KILLS)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    lines = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
+    assert len(lines) == KILLS
+    began = 0
+    for k, n, taken in lines:
+        path = tmp_path / f"{k}.rrd"
+        if taken == 0:  # killed before its first block was taken: there may be no description yet
+            if path.exists() and path.stat().st_size:
+                with contextlib.suppress(InputError):
+                    assert open_recording(path).n_blocks <= 1
+            continue
+        began += 1
+        recording = open_recording(path, hold_bytes=HELD_BYTES)
+        read = list(recording.blocks())
+        assert not recording.finished
+        assert taken - 1 <= len(read) <= taken + 1, (k, n, taken)  # + 1: written, and killed before it could say so
+        for i, block in enumerate(read):
+            assert_same_block(a_block(i * n, n), block)
+    assert began > KILLS // 2
+
+
+def test_a_recorder_that_was_killed_is_told_from_one_that_finished(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    a_run(path, 3)
+    assert open_recording(path).finished
+    found = extent(path)
+    os.truncate(path, found.whole_bytes)
+    assert extent(path) == Extent(found.whole_bytes, False, False)
+    recording = open_recording(path)
+    assert (recording.finished, recording.repaired, recording.n_blocks) == (False, False, 3)
+
+
+@pytest.mark.parametrize("tail", [b"\0", b"\0" * 4096, b"\1\0\0\0\0\0\0\0", b"\xff" * 100])
+def test_what_power_loss_leaves_behind_the_last_block_does_no_harm(tmp_path: Path, tail: bytes) -> None:
+    path = tmp_path / "run.rrd"
+    written = a_run(path, 5)
+    os.truncate(path, extent(path).whole_bytes)
+    with path.open("ab") as file:
+        file.write(tail)
+    recording = open_recording(path)
+    assert recording.repaired
+    for a, b in zip(written, recording.blocks(), strict=True):
+        assert_same_block(a, b)
+
+
+def a_run_in_parts(path: Path, storage: Storage, n_blocks: int = 20) -> list[Block]:
+    blocks = [a_block(k * 500) for k in range(n_blocks)]
+    with a_recorder(path, storage=storage) as recorder:
+        for k, block in enumerate(blocks):
+            recorder.write_block(block)
+            recorder.write_note("events", k * 500, json.dumps({"k": k}))
+    return blocks
+
+
+@pytest.mark.parametrize("limits", [Storage(rotate_s=0.045, keep_free_bytes=0), Storage(rotate_bytes=30_000)])
+def test_a_run_in_several_files_is_read_as_one(tmp_path: Path, limits: Storage) -> None:
+    path = tmp_path / "run.rrd"
+    written = a_run_in_parts(path, limits)
+    files = sorted(tmp_path.glob("*.rrd"))
+    assert 3 <= len(files) < 20
+    for named in (path, tmp_path):
+        recording = open_recording(named)
+        assert recording.parts == tuple(part_path(path, k + 1) for k in range(len(files)))
+        assert recording.index == tuple((k * 500, 500) for k in range(20))
+        assert recording.missing_parts == ()
+        assert [s for s, _ in recording.notes("events")] == [k * 500 for k in range(20)]
+        for a, b in zip(written, recording.blocks(), strict=True):
+            assert_same_block(a, b)
+    second = open_recording(part_path(path, 2))
+    assert second.parts == (part_path(path, 2),)
+    assert second.plant == recording.plant  # each file says what it is about
+
+
+def test_a_missing_file_of_a_run_is_named_and_anothers_is_not_taken_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    a_run_in_parts(path, Storage(rotate_s=0.045))
+    part_path(path, 3).unlink()
+    (tmp_path / "else").mkdir()
+    a_run(tmp_path / "else" / "other.rrd", 2)
+    shutil.copy(tmp_path / "else" / "other.rrd", part_path(path, 3))
+    recording = open_recording(path)
+    assert recording.missing_parts == (3,)
+    assert part_path(path, 3) not in recording.parts
+
+
+def test_a_budget_ends_the_recording_whole_or_lets_the_oldest_files_go(tmp_path: Path) -> None:
+    strict, ring = tmp_path / "strict.rrd", tmp_path / "ring.rrd"
+    with pytest.raises(RunError, match=r"recording stopped: it has grown to .* of the 60 kB it may take"):
+        a_run_in_parts(strict, Storage(budget_bytes=60_000))
+    kept = open_recording(strict)
+    assert kept.finished
+    assert 3 < kept.n_blocks < 20
+    assert_same_block(a_block(0), next(kept.blocks()))
+    a_run_in_parts(ring, Storage(rotate_bytes=25_000, budget_bytes=80_000, drop_oldest=True), 60)
+    files = sorted(tmp_path.glob("ring*.rrd"))
+    assert sum(f.stat().st_size for f in files) < 100_000
+    with pytest.raises(InputError, match="cannot be read"):
+        open_recording(ring)
+    recording = open_recording(min(files, key=lambda f: int(f.stem.rpartition("part")[2])))
+    assert recording.missing_parts[0] == 1
+    assert recording.end_sample == 60 * 500
+    for first, block in zip(recording.index, recording.blocks(), strict=True):
+        assert_same_block(a_block(first[0]), block)
+
+
+def test_recording_ends_whole_before_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.rrd"
+    left = iter([*[10**9] * 6, *[10**6] * 100])
+    monkeypatch.setattr("twin.rig.recording.free_bytes", lambda _: next(left))
+    with pytest.raises(RunError, match=r"the disk has 1 MB left, and 100 MB are to stay free"):
+        a_run_in_parts(path, Storage())
+    recording = open_recording(path)
+    assert recording.finished
+    assert recording.n_blocks == 5
+
+
+def test_a_disk_without_room_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin.rig.recording.free_bytes", lambda _: 5_000_000)
+    with pytest.raises(RunError, match="nothing was recorded"):
+        a_recorder(tmp_path / "run.rrd", storage=Storage())
+    assert not (tmp_path / "run.rrd").exists()
+
+
+def test_sizes_and_times_are_read_as_people_write_them() -> None:
+    assert storage("500MB", "20GB", drop_oldest=True) == Storage(500_000_000, None, 20 * 10**9, True)
+    assert storage("10min", None) == Storage(None, 600.0)
+    assert storage("1.5 GB, 2h", None) == Storage(1_500_000_000, 7200.0)
+    assert storage(None, None) == Storage()
+    for rotate, budget in (("ten", None), ("10", None), ("5 parsec", None), ("0s", None), (None, "10min")):
+        with pytest.raises(InputError):
+            storage(rotate, budget)
+    with pytest.raises(InputError, match="if there are several"):
+        storage(None, "1GB", drop_oldest=True)
+    with pytest.raises(InputError, match="does not hold two files"):
+        storage("1GB", "1GB")
 
 
 @pytest.mark.parametrize("part", [0.35, 0.8, 0.999])
@@ -265,9 +410,10 @@ def test_files_that_are_no_recordings_are_refused_in_words(tmp_path: Path) -> No
     for path in (foreign, text):
         with pytest.raises(InputError, match="give a file that 'atmd' recorded"):
             open_recording(path)
-    for path in (tmp_path / "nothing.rrd", tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
-            open_recording(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        open_recording(tmp_path / "nothing.rrd")
+    with pytest.raises(InputError, match=r"holds not one run but foreign\.rrd, text\.rrd"):
+        open_recording(tmp_path)
 
 
 def test_a_recording_is_not_overwritten_unless_told(tmp_path: Path) -> None:
@@ -299,6 +445,7 @@ def test_a_disk_that_is_full_from_the_start_is_reported() -> None:
             run_config_json="{}",
             seed=None,
             overwrite=True,
+            storage=Storage(keep_free_bytes=0),
         )
 
 

@@ -8,12 +8,13 @@ import warnings
 import weakref
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from pydantic import ValidationError
 from rerun.chunk import LazyChunkStream, RrdReader
 from rerun.error_utils import RerunWarning
@@ -24,8 +25,12 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.recording import ACKNOWLEDGEMENTS, COMMANDS, FORMAT_VERSION, PROPERTY, ROOT
 from twin.rig.rerun_tool import rerun_environment, rerun_program
+from twin.rig.rrf import copy_whole_part, extent
+from twin.rig.storage import part_of, parts_beside
 
 _REPAIR_TIMEOUT_S = 600.0
+HELD_BYTES = 256_000_000
+"""Raw blocks up to so much stay in memory once read, if asked: a minute at 50 kS/s is read once and not twice."""
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
@@ -36,7 +41,11 @@ class Recording:
     ----------
     path
         The file as given.
-    plant, config_id, sample_rate_hz, channels, run_config_json, seed
+    parts
+        The files of the run that are read, in order.
+    missing_parts
+        Numbers of files that are no longer there, or not yet found, before or between those.
+    plant, config_id, sample_rate_hz, channels, run_config_json, seed, software
         As the recorder was given them.
     program_version
         Of the program that recorded it.
@@ -45,29 +54,43 @@ class Recording:
     end_sample
         Index of the first sample after the last block.
     repaired
-        The file was cut short; what follows its last whole row is lost.
+        A file was cut short; what follows its last whole row is lost.
+    finished
+        The recorder closed its last file; else it was killed, or is still at it.
     """
 
     path: Path
+    parts: tuple[Path, ...]
+    missing_parts: tuple[int, ...]
     plant: Plant
     config_id: str
     sample_rate_hz: float
     channels: tuple[Channel, ...]
     run_config_json: str
     seed: int | None
+    software: dict[str, str]
     program_version: str
     n_samples: int
     n_blocks: int
     end_sample: int
     repaired: bool
-    _source: Path
+    finished: bool
+    _run_id: str
+    _sources: tuple[Path, ...]
     _in_order: bool
     _notes: dict[str, list[tuple[int, str]]] = field(repr=False)
+    _index: tuple[tuple[int, int], ...] = field(repr=False)
+    _held: tuple[pa.RecordBatch, ...] | None = field(repr=False)
 
     @property
     def source(self) -> Path:
-        """The file that is read: the given one, or the whole part of it where that was cut short."""
-        return self._source
+        """The first file that is read: the given one, or the whole part of it where that was cut short."""
+        return self._sources[0]
+
+    @property
+    def index(self) -> tuple[tuple[int, int], ...]:
+        """(first sample, samples) of every block, by first sample."""
+        return self._index
 
     def blocks(self) -> Iterator[Block]:
         """Blocks as they were recorded, by first sample; a few at a time in memory unless they lie out of order.
@@ -98,11 +121,18 @@ class Recording:
         return tuple(self._notes.get(kind, ()))
 
     def _blocks_in_file(self) -> Iterator[Block]:
-        for chunk in _stream(self._source).filter(content=f"/{ROOT}/raw"):
-            batch = chunk.to_record_batch()
+        for batch in self._batches():
             rows = zip(batch.column("sample").to_pylist(), batch.column("block").to_pylist(), strict=True)
             for sample, cell in rows:
                 yield self._block(sample, cell[0])
+
+    def _batches(self) -> Iterator[pa.RecordBatch]:
+        if self._held is not None:
+            yield from self._held
+            return
+        for source in self._sources:
+            for chunk in _stream(source).filter(content=f"/{ROOT}/raw"):
+                yield chunk.to_record_batch()
 
     def _block(self, first_sample: int, row: dict[str, Any]) -> Block:
         if zlib.crc32(row["invalid"], zlib.crc32(row["samples"])) != row["crc32"]:
@@ -130,15 +160,95 @@ class Recording:
         )
 
 
-def open_recording(path: Path) -> Recording:
+def open_recording(path: Path, *, hold_bytes: int = 0, alone: bool = False) -> Recording:
     """Open a recorded run, also one whose recorder was killed or whose file was cut short.
+
+    Parameters
+    ----------
+    path
+        A file, or a folder that holds one run. The first file there is of a run stands for all of them; any other for
+        itself alone.
+    hold_bytes
+        Keep raw blocks in memory up to so much, for whoever reads them at once (see `HELD_BYTES`).
+    alone
+        Take the first file for itself alone, too.
 
     Raises
     ------
     InputError
-        If the file cannot be read, holds no whole row, or is no recording of this program.
+        If a file cannot be read, holds no whole row, is no recording of this program, or a folder holds no run, or
+        more than one.
     """
     path = Path(path)
+    if path.is_dir():
+        path = _only_run(path)
+    first = _open_file(path, hold_bytes)
+    _, number = part_of(path)
+    beside = {} if alone else parts_beside(path)
+    if min(beside, default=number) != number:
+        return first
+    found, numbers = [first], [number]
+    for k, other in sorted(beside.items()):
+        if k <= number:
+            continue
+        part = _open_file(other, hold_bytes - sum(_held_bytes(p) for p in found))
+        if part._run_id != first._run_id:
+            continue  # another run's, left beside this one
+        found.append(part)
+        numbers.append(k)
+    missing = tuple(k for k in range(1, numbers[-1]) if k not in numbers) if len(found) > 1 or number > 1 else ()
+    return _joined(found, missing)
+
+
+def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
+    """One run of several files."""
+    first = parts[0]
+    if len(parts) == 1:
+        return replace(first, missing_parts=missing) if missing else first
+    notes: dict[str, list[tuple[int, str]]] = {}
+    for part in parts:
+        for kind, rows in part._notes.items():
+            notes.setdefault(kind, []).extend(rows)
+    index = tuple(sorted(row for part in parts for row in part.index))
+    held = [part._held for part in parts]
+    whole = replace(
+        first,
+        parts=tuple(p for part in parts for p in part.parts),
+        missing_parts=missing,
+        n_samples=sum(part.n_samples for part in parts),
+        n_blocks=sum(part.n_blocks for part in parts),
+        end_sample=max(part.end_sample for part in parts),
+        repaired=any(part.repaired for part in parts),
+        finished=parts[-1].finished,
+        _sources=tuple(s for part in parts for s in part._sources),
+        _in_order=all(part._in_order for part in parts)
+        and all(a.index[-1:] <= b.index[:1] or not b.index for a, b in pairwise(parts)),
+        _notes={kind: sorted(rows, key=lambda row: row[0]) for kind, rows in notes.items()},
+        _index=index,
+        _held=None if None in held else tuple(batch for some in held if some is not None for batch in some),
+    )
+    # Repaired copies live as long as the recordings they were made for.
+    weakref.finalize(whole, list, parts)
+    return whole
+
+
+def _only_run(folder: Path) -> Path:
+    runs: dict[Path, int] = {}
+    for file in folder.glob("*.rrd"):
+        first, number = part_of(file)
+        runs[first] = min(number, runs.get(first, number))
+    if len(runs) != 1:
+        names = ", ".join(sorted(p.name for p in runs)) or "none"
+        raise InputError(f"{folder}: holds not one run but {names}; give the file")
+    ((first, number),) = runs.items()
+    return parts_beside(first)[number]
+
+
+def _held_bytes(recording: Recording) -> int:
+    return sum(batch.nbytes for batch in recording._held or ())
+
+
+def _open_file(path: Path, hold_bytes: int) -> Recording:
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: is empty; nothing was recorded")
@@ -148,14 +258,16 @@ def open_recording(path: Path) -> Recording:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if magic != b"RRF2":
         raise InputError(f"{path}: is no Rerun recording (.rrd); give a file that 'atmd' recorded")
-    try:
-        return _scan(path, path)
-    except (RuntimeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    # Rerun's reader takes a file that ends inside a message's head for a whole one.
+    if not extent(path).cut:
+        try:
+            return _scan(path, path, hold_bytes)
+        except (RuntimeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
     folder = tempfile.mkdtemp(prefix="atmd-")
     try:
-        recording = _scan(path, _repair(path, Path(folder)))
+        recording = _scan_damaged(path, Path(folder), hold_bytes)
     except (RuntimeError, ValueError) as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, InputError):
@@ -166,6 +278,17 @@ def open_recording(path: Path) -> Recording:
     # The repaired copy stays for as long as the recording is in use.
     weakref.finalize(recording, shutil.rmtree, folder, ignore_errors=True)
     return recording
+
+
+def _scan_damaged(path: Path, folder: Path, hold_bytes: int) -> Recording:
+    """Read what is whole of a file: up to where it was cut, or, with Rerun's own tool, around the damage."""
+    cut = folder / "whole.rrd"
+    if copy_whole_part(path, cut):
+        try:
+            return _scan(path, cut, hold_bytes)
+        except (RuntimeError, ValueError):
+            cut.unlink()  # it was not the end alone
+    return _scan(path, _repair(path, folder), hold_bytes)
 
 
 def _repair(path: Path, folder: Path) -> Path:
@@ -192,12 +315,13 @@ def _stream(path: Path) -> LazyChunkStream:
         return RrdReader(path).stream()
 
 
-def _scan(path: Path, source: Path) -> Recording:
+def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
     """One pass over the file: properties, notes, and where the blocks are."""
     properties: dict[str, str] = {}
     notes: dict[str, list[tuple[int, bytes, str]]] = {}
     firsts: list[int] = []
     lengths: list[int] = []
+    held: list[pa.RecordBatch] | None = [] if hold_bytes > 0 else None
     for chunk in _stream(source):
         entity = chunk.entity_path
         if entity == f"/__properties/{PROPERTY}":
@@ -211,6 +335,11 @@ def _scan(path: Path, source: Path) -> Recording:
             batch = chunk.to_record_batch()
             firsts += batch.column("sample").to_pylist()
             lengths += batch.column("block").flatten().field("n_samples").to_pylist()
+            hold_bytes -= batch.nbytes
+            if held is not None and hold_bytes >= 0:
+                held.append(batch)
+            else:
+                held = None
         elif entity.startswith(f"/{ROOT}/"):
             batch = chunk.to_record_batch()
             rows = zip(
@@ -223,15 +352,21 @@ def _scan(path: Path, source: Path) -> Recording:
     known = _parse(path, properties)
     return Recording(
         path=path,
+        parts=(path,),
+        missing_parts=(),
         **known,
         n_samples=sum(lengths),
         n_blocks=len(firsts),
         end_sample=max((f + n for f, n in zip(firsts, lengths, strict=True)), default=0),
         repaired=source != path,
-        _source=source,
+        finished=extent(path).finished,
+        _run_id=properties.get("run_id", ""),
+        _sources=(source,),
         _in_order=all(a <= b for a, b in pairwise(firsts)),
         # Row ids count up as rows are written: they keep the order of notes at the same sample.
         _notes={kind: [(sample, text) for sample, _, text in sorted(rows)] for kind, rows in notes.items()},
+        _index=tuple(sorted(zip(firsts, lengths, strict=True))),
+        _held=None if held is None else tuple(held),
     )
 
 
@@ -250,6 +385,7 @@ def _parse(path: Path, properties: dict[str, str]) -> dict[str, Any]:
             "channels": tuple(Channel(name, unit) for name, unit in json.loads(properties["channels"])),
             "run_config_json": properties["run_config"],
             "seed": json.loads(properties["seed"]),
+            "software": json.loads(properties.get("software", "{}")),
             "program_version": properties["program_version"],
         }
     except (KeyError, ValidationError, json.JSONDecodeError) as error:

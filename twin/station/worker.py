@@ -6,7 +6,7 @@ ways differ, and it is recorded: a replay takes every answer at the block at whi
 - ``TunerProcess(lag_blocks=None)``: a live rig. An answer is taken when it is there; the loop never waits.
 - ``TunerProcess(lag_blocks=n)`` and ``TunerHere(AfterBlocks(n))``: runs that can wait for the twin. The answer to a
   question of block k is taken at block k + n, whatever the machine does meanwhile.
-- ``TunerHere(AsRecorded(...))``: a replay.
+- ``TunerHere(AsRecorded(...))``: a replay. Recorded answers to the very same questions are taken as they are.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -25,6 +25,7 @@ from tuning.retune import TuningGoal
 from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
 from twin.station.advice import Adviser, Answer, Question
+from twin.station.answers import NOTHING_KNOWN, KnownAnswers, chain, chain_begin
 
 START_TIMEOUT_S = 120.0
 ANSWER_TIMEOUT_S = 60.0
@@ -36,11 +37,15 @@ MOST_RESTARTS = 3
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What the loop took at a block: an answer, or the news that there will be none (``trouble`` says why)."""
+    """What the loop took at a block: an answer, or the news that there will be none (``trouble`` says why).
+
+    ``chain`` is the fingerprint of the question and those before it, see `twin.station.answers`.
+    """
 
     number: int
     answer: Answer | None
     trouble: str = ""
+    chain: str = ""
 
 
 class Tuner(Protocol):
@@ -137,6 +142,13 @@ class TunerHere:
         See `Adviser`.
     when
         At which blocks.
+    known
+        Answers of the run that is being replayed; what is among them is not worked out again.
+
+    Attributes
+    ----------
+    worked_out
+        Answers that were.
 
     Raises
     ------
@@ -144,17 +156,26 @@ class TunerHere:
         If limits the tuner needs are missing.
     """
 
-    def __init__(self, plant: Plant, facts: LoopFacts, goal: TuningGoal, when: When) -> None:
-        self._fresh: Callable[[], Adviser] = lambda: Adviser(plant, facts, goal)
+    def __init__(
+        self, plant: Plant, facts: LoopFacts, goal: TuningGoal, when: When, known: KnownAnswers = NOTHING_KNOWN
+    ) -> None:
+        self._order = (plant, facts, goal)
         self._adviser = self._fresh()
-        self._when = when
+        self._when, self._known = when, known
+        self._begin = self._chain = chain_begin(plant, facts, goal)
+        self._passed_over: list[Question] = []
         self._open: Question | None = None
         self._blocks = 0
         self._asked = 0
+        self.worked_out = 0
+
+    def _fresh(self) -> Adviser:
+        return Adviser(*self._order)
 
     def warm_up(self, question: Question) -> None:
-        """Answer a question on a throwaway adviser."""
-        self._fresh().answer(question)
+        """Answer a question on a throwaway adviser, unless the answers are known."""
+        if not self._known.by_chain:
+            self._fresh().answer(question)
 
     def ready(self, sample: int) -> bool:
         """Whether no question is open and the run asked one here."""
@@ -163,6 +184,7 @@ class TunerHere:
     def ask(self, question: Question) -> None:
         """Keep the question until its block."""
         self._open, self._blocks, self._asked = question, 0, question.number
+        self._chain = chain(self._chain, question)
 
     def take(self, sample: int) -> Arrival | None:
         """Work the answer out, if its block has come."""
@@ -173,13 +195,27 @@ class TunerHere:
         trouble = self._when.due(question.number, self._blocks, sample)
         if trouble is None:
             return None
-        self._open = None
+        self._open, asked = None, self._chain
         answer = None
         if not trouble:
-            answer, trouble = _answer(self._adviser, question)
+            answer = self._known.get(asked)
+            if answer is not None:
+                self._passed_over.append(question)
+            else:
+                answer, trouble = self._work_out(question)
         if answer is None:
             self._adviser = self._fresh()  # as a worker that is started anew it remembers nothing
-        return Arrival(question.number, answer, trouble)
+            self._chain = self._begin
+            self._passed_over.clear()
+        return Arrival(question.number, answer, trouble, asked)
+
+    def _work_out(self, question: Question) -> tuple[Answer | None, str]:
+        # An adviser remembers what it was asked: what was passed over is made up for first.
+        for before in self._passed_over:
+            _answer(self._adviser, before)
+        self._passed_over.clear()
+        self.worked_out += 1
+        return _answer(self._adviser, question)
 
     def close(self) -> None:
         """Nothing to end."""
@@ -209,6 +245,7 @@ class TunerProcess:
         self._lag = lag_blocks
         self._open: int | None = None
         self._blocks = 0
+        self._chain = self._begin = chain_begin(plant, facts, goal)
         self._warm: Question | None = None
         self._is_ready = False
         self._process: SpawnProcess | None = None
@@ -249,6 +286,7 @@ class TunerProcess:
     def ask(self, question: Question) -> None:
         """Hand the question over."""
         self._open, self._blocks = question.number, 0
+        self._chain = chain(self._chain, question)
         self._send(("ask", question))
 
     def take(self, sample: int) -> Arrival | None:
@@ -273,7 +311,7 @@ class TunerProcess:
         if answer is None:
             return self._lost(number, trouble)
         self._open = None
-        return Arrival(number, answer)
+        return Arrival(number, answer, chain=self._chain)
 
     def close(self) -> None:
         """End the process and wait until it is gone."""
@@ -296,7 +334,7 @@ class TunerProcess:
         self._process, self._connection, self._is_ready = process, ours, False
 
     def _lost(self, number: int, why: str) -> Arrival:
-        self._open = None
+        self._open, self._chain = None, self._begin
         self.close()
         if self.restarts >= MOST_RESTARTS:
             return Arrival(number, None, f"{why}; it is not started again after {self.restarts} restarts")
