@@ -14,8 +14,8 @@ import numpy as np
 from tuning.retune import Prediction
 from twin.station.frame import Performance
 
-SETTLED_BLOCKS = 3
-"""Blocks under the same gains before the motion counts as settled."""
+SETTLED_BLOCKS = 1
+"""Whole blocks under the same gains before the motion may count as settled; what follows says whether it is."""
 
 SETTLED_1_S = 0.5
 """Nor may the absorber's amplitude or phase move faster than this, or the primary's, |A'/A|."""
