@@ -44,16 +44,41 @@ def solve_step(hessian: Array, gradient: Array, rows: Array, upper: Array) -> St
     into = np.ascontiguousarray(np.linalg.inv(root).T)  # s = into z
     pull = into.T @ gradient
     reach = max(float(np.linalg.norm(pull)), 1e-300)
-    leaning = rows @ into
-    size = np.maximum(np.sqrt(np.einsum("ij,ij->i", leaning, leaning)), 1e-12)
-    leaning /= size[:, None]
+    leaning, size, bound = np.empty((len(upper), VARIABLES)), np.empty(len(upper)), np.empty(len(upper))
+    straighten(rows, upper, into, reach, leaning, size, bound)
     z = -pull / reach
     binding, multipliers = np.zeros(VARIABLES, dtype=np.int64), np.zeros(VARIABLES)
-    count = project(leaning, upper / (size * reach), z, binding, multipliers)
+    count = project(leaning, bound, z, binding, multipliers)
     if count < 0:
         return None
     chosen = binding[:count].copy()
     return Step(into @ z * reach, chosen, multipliers[:count] * reach / size[chosen])
+
+
+@kernel
+def straighten(
+    rows: Array, upper: Array, into: Array, reach: float, leaning: Array, size: Array, bound: Array
+) -> None:
+    """Rows in coordinates in which the free step is a unit vector, each of unit length.
+
+    Parameters
+    ----------
+    rows, upper
+        (n, 3), (n,) as asked.
+    into, reach
+        (3, 3) and the length that make a step of the new coordinates.
+    leaning, size, bound
+        (n, 3), (n,), (n,) receive rows, their length before, and what they must stay below.
+    """
+    for i in range(len(upper)):
+        length = 0.0
+        for v in range(3):
+            leaning[i, v] = rows[i, 0] * into[0, v] + rows[i, 1] * into[1, v] + rows[i, 2] * into[2, v]
+            length += leaning[i, v] * leaning[i, v]
+        size[i] = max(np.sqrt(length), 1e-12)
+        bound[i] = upper[i] / (size[i] * reach)
+        for v in range(3):
+            leaning[i, v] /= size[i]
 
 
 @kernel

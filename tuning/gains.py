@@ -105,19 +105,18 @@ class GainProgram:
         upper: NDArray[np.floating],
         warm: NDArray[np.floating],
     ) -> Array:
-        P = sparse.csc_matrix(np.triu(np.ones((3, 3))))
-        A = sparse.csc_matrix(np.ones(matrix.shape))
         # Dense patterns written out in full, so that a zero today does not change the structure tomorrow.
-        P.data = np.concatenate([hessian[: j + 1, j] for j in range(3)])
-        A.data = matrix.T.ravel()
+        upper_part = np.concatenate([hessian[: j + 1, j] for j in range(3)])
+        columns = matrix.T.ravel()
         if self._solver is None:
             self._solver = osqp.OSQP()
             self._solver.setup(
-                P, linear, A, lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=1_000,
+                sparse.csc_matrix(np.triu(np.ones((3, 3)))), linear, sparse.csc_matrix(np.ones(matrix.shape)),
+                lower, upper, verbose=False, eps_abs=1e-5, eps_rel=1e-5, max_iter=1_000,
                 rho=PENALTIES[0], scaling=0, adaptive_rho=False,  # both would carry bits of one question into the next
             )  # fmt: skip
         # Also after setup, so that the first question is answered to the same bits as when it is asked again.
-        self._solver.update(Px=P.data, q=linear, Ax=A.data, l=lower, u=upper)
+        self._solver.update(Px=upper_part, q=linear, Ax=columns, l=lower, u=upper)
         x, y = np.asarray(warm), np.zeros(ROWS + 3)  # rows change places: their multipliers are no start
         for penalty in PENALTIES:
             self._solver.update_settings(rho=penalty)

@@ -6,17 +6,18 @@ a delay of any length. Stability is judged by the closed loop's eigenvalues, nev
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import control
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import eig, expm
+from scipy.linalg import expm
+from scipy.linalg.lapack import dgeev
 
 from twin.control.chain import CHAIN_STATES, chain_matrices, chain_response
 from twin.control.schedule import Gains
 from twin.plant.config import Plant, Shaker
 from twin.plant.discrete import DiscreteModel, discretise
+from twin.plant.errors import RunError
 from twin.plant.linear import Array, ComplexArray, LinearModel, linear_model
 
 WELL_CONDITIONED = 1e9
@@ -131,6 +132,7 @@ class RigModel:
         rows[3, model.states.index(f"i_{coil.name}")] = 1.0
         self._rows, self._feed = rows, feed
         self._early, self._late = self._held(model.A, model.B[:, self.coil_input])
+        self._cut: tuple[tuple[float, float], tuple[Array, Array, Array]] | None = None
         self._residues: ComplexArray | None = None
         self._decays: ComplexArray | None = None
         self._split_into_modes()
@@ -236,28 +238,37 @@ class RigModel:
 
     def closed_loop_matrix(self, gains: Gains) -> Array:
         """One sample of the closed loop: plant states, filter chain, commands on their way to the converter."""
+        base, enters, commands = self._opened(gains.low_pass_hz, gains.high_pass_hz)
+        law = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
+        return np.asarray(base + np.outer(enters, law @ commands))
+
+    def _opened(self, low_pass_hz: float, high_pass_hz: float) -> tuple[Array, Array, Array]:
+        """The loop cut at the command: its matrix (m, m), where a command enters (m,), commands per gain (3, m)."""
+        if self._cut is not None and self._cut[0] == (low_pass_hz, high_pass_hz):
+            return self._cut[1]
         fs, whole = self.facts.sample_rate_hz, self.facts.delay_samples
-        A, B, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, fs)
-        law = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m]) / self.coil.force_constant_n_a
+        A, B, C, D = chain_matrices(low_pass_hz, high_pass_hz, fs)
         n = len(self._late)
         line = n + CHAIN_STATES
         size = line + whole + (1 if self.facts.delay_fraction else 0)
         # A coil behind a current loop has inductance: its reference moves no acceleration at once.
-        command = np.zeros(size)
-        command[:n], command[n:line] = (law @ D)[0] * self._rows[2], law @ C
-        out = np.zeros((size, size))
-        out[:n, :n], out[n:line, :n], out[n:line, n:line] = self.discrete.F, B * self._rows[2], A
+        commands, enters = np.zeros((3, size)), np.zeros(size)
+        commands[:, :n], commands[:, n:line] = D * self._rows[2], C
+        commands /= self.coil.force_constant_n_a
+        base = np.zeros((size, size))
+        base[:n, :n], base[n:line, :n], base[n:line, n:line] = self.discrete.F, B * self._rows[2], A
         for effect, age in ((self._late, whole), (self._early, whole + 1)):
             if not effect.any():
                 continue
             if age == 0:
-                out[:n] += np.outer(effect, command)
+                enters[:n] += effect
             else:
-                out[:n, line + age - 1] += effect
+                base[:n, line + age - 1] += effect
         if size > line:
-            out[line] = command
-            out[line + 1 :, line:-1] = np.eye(size - line - 1)
-        return out
+            enters[line] = 1.0
+            base[line + 1 :, line:-1] = np.eye(size - line - 1)
+        self._cut = (low_pass_hz, high_pass_hz), (base, enters, commands)
+        return base, enters, commands
 
     def stepping(self) -> DiscreteModel:
         """The plant for stepping sample by sample, with the measured relative acceleration as its one output.
@@ -281,23 +292,24 @@ class RigModel:
         tuple of ndarray
             (count,) real parts, the largest first, one of each pair; (count, 3) their slopes over alpha, beta, gamma.
         """
-        n, fs, k = len(self._late), self.facts.sample_rate_hz, self.coil.force_constant_n_a
-        found: Any = eig(self.closed_loop_matrix(gains), left=True, right=True)
-        poles, left, right = found[0], found[1], found[2]
-        overlap = np.einsum("ij,ij->j", left.conj(), right)
+        _, enters, commands = self._opened(gains.low_pass_hz, gains.high_pass_hz)
+        real, imaginary, left, right, failed = dgeev(self.closed_loop_matrix(gains))
+        if failed:
+            raise RunError("the closed loop's poles could not be computed: its matrix is not finite or too large")
+        poles = real + 1j * imaginary
+        order = np.argsort(-np.abs(poles), kind="stable")
+        chosen = [int(j) for j in order if imaginary[j] >= 0.0][:count]
+        poles = poles[chosen]
+        # Of a pair the real and the imaginary part of the first one's vectors stand side by side.
+        second = [1j * (imaginary[j] > 0.0) for j in chosen]
+        beside = np.minimum(np.array(chosen) + 1, len(order) - 1)
+        left, right = (part[:, chosen] + second * part[:, beside] for part in (left, right))
+        overlap = np.sum(left.conj() * right, axis=0)
         # A pole on top of another has no slope of its own.
         share = np.where(np.abs(overlap) > 1e-7, 1.0 / np.where(overlap == 0.0, 1.0, overlap), 0.0)
-        order = np.argsort(-np.abs(poles), kind="stable")
-        chosen = [int(j) for j in order if poles[j].imag >= 0.0][:count]
-        _, _, C, D = chain_matrices(gains.low_pass_hz, gains.high_pass_hz, fs)
-        line = n + CHAIN_STATES
-        # The gains stand in the command alone: per unit, what each state adds to it, and where it goes.
-        commands = (D * self._rows[2] @ right[:n] + C @ right[n:line]) / k
-        enters = left[line].conj() if len(poles) > line else np.zeros(len(poles), dtype=np.complex128)
-        if self.facts.delay_samples == 0:
-            enters = enters + self._late @ left[:n].conj()
-        turns = (enters * share)[chosen, None] * commands.T[chosen] / poles[chosen, None]
-        return np.log(np.abs(poles[chosen])) * fs, np.asarray(turns.real * fs)
+        turns = (enters @ left.conj()) * share / poles * (commands @ right)
+        fs = self.facts.sample_rate_hz
+        return np.log(np.abs(poles)) * fs, np.asarray(turns.T.real * fs)
 
     @property
     def modes_hz(self) -> Array:
