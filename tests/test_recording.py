@@ -21,6 +21,7 @@ from twin.plant.errors import InputError, RunError
 from twin.plant.files import load_plant
 from twin.rig.recorded import HELD_BYTES, Recording, open_recording
 from twin.rig.recording import Recorder
+from twin.rig.regroup import in_pieces, mark_of, restored
 from twin.rig.rrf import Extent, extent
 from twin.rig.storage import Storage, part_path, storage
 
@@ -260,6 +261,27 @@ def test_what_power_loss_leaves_behind_the_last_block_does_no_harm(tmp_path: Pat
         assert_same_block(a, b)
 
 
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(written=blocks(), size=st.integers(1, 70))
+def test_blocks_read_in_pieces_of_any_size_are_the_recorded_ones_again(
+    tmp_path: Path, written: list[Block], size: int
+) -> None:
+    kept = [block for block in written if block.n_samples]
+    pieces = list(in_pieces(kept, size))
+    assert all(piece.n_samples <= size for piece in pieces)
+    for a, b in zip(kept, restored(pieces, map(mark_of, kept)), strict=True):
+        assert a.values.tobytes() == b.values.tobytes()
+        assert np.array_equal(a.valid, b.valid)
+        assert mark_of(a) == mark_of(b)
+
+
+def test_pieces_with_a_hole_are_not_put_together(tmp_path: Path) -> None:
+    written = [a_block(k * 500) for k in range(4)]
+    pieces = list(in_pieces(written, 300))
+    with pytest.raises(InputError, match="from 600 on are missing"):
+        list(restored([*pieces[:2], *pieces[3:]], map(mark_of, written)))
+
+
 def a_run_in_parts(path: Path, storage: Storage, n_blocks: int = 20) -> list[Block]:
     blocks = [a_block(k * 500) for k in range(n_blocks)]
     with a_recorder(path, storage=storage) as recorder:
@@ -278,7 +300,7 @@ def test_a_run_in_several_files_is_read_as_one(tmp_path: Path, limits: Storage) 
     for named in (path, tmp_path):
         recording = open_recording(named)
         assert recording.parts == tuple(part_path(path, k + 1) for k in range(len(files)))
-        assert recording.index == tuple((k * 500, 500) for k in range(20))
+        assert [(m.first_sample, m.n_samples) for m in recording.marks] == [(k * 500, 500) for k in range(20)]
         assert recording.missing_parts == ()
         assert [s for s, _ in recording.notes("events")] == [k * 500 for k in range(20)]
         for a, b in zip(written, recording.blocks(), strict=True):
@@ -316,8 +338,8 @@ def test_a_budget_ends_the_recording_whole_or_lets_the_oldest_files_go(tmp_path:
     recording = open_recording(min(files, key=lambda f: int(f.stem.rpartition("part")[2])))
     assert recording.missing_parts[0] == 1
     assert recording.end_sample == 60 * 500
-    for first, block in zip(recording.index, recording.blocks(), strict=True):
-        assert_same_block(a_block(first[0]), block)
+    for mark, block in zip(recording.marks, recording.blocks(), strict=True):
+        assert_same_block(a_block(mark.first_sample), block)
 
 
 def test_recording_ends_whole_before_the_disk_is_full(

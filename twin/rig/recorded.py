@@ -24,6 +24,7 @@ from twin.plant.blocks import Block, Channel
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.recording import ACKNOWLEDGEMENTS, COMMANDS, FORMAT_VERSION, PROPERTY, ROOT
+from twin.rig.regroup import Mark
 from twin.rig.rerun_tool import rerun_environment, rerun_program
 from twin.rig.rrf import copy_whole_part, extent
 from twin.rig.storage import part_of, parts_beside
@@ -79,7 +80,7 @@ class Recording:
     _sources: tuple[Path, ...]
     _in_order: bool
     _notes: dict[str, list[tuple[int, str]]] = field(repr=False)
-    _index: tuple[tuple[int, int], ...] = field(repr=False)
+    _marks: tuple[Mark, ...] = field(repr=False)
     _held: tuple[pa.RecordBatch, ...] | None = field(repr=False)
 
     @property
@@ -88,19 +89,24 @@ class Recording:
         return self._sources[0]
 
     @property
-    def index(self) -> tuple[tuple[int, int], ...]:
-        """(first sample, samples) of every block, by first sample."""
-        return self._index
+    def marks(self) -> tuple[Mark, ...]:
+        """Every block without its samples, by first sample."""
+        return self._marks
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self, from_sample: int = 0) -> Iterator[Block]:
         """Blocks as they were recorded, by first sample; a few at a time in memory unless they lie out of order.
+
+        Parameters
+        ----------
+        from_sample
+            Leave out blocks that begin before.
 
         Raises
         ------
         InputError
             At a block whose checksum is wrong.
         """
-        found = self._blocks_in_file()
+        found = self._blocks_in_file(from_sample)
         if self._in_order:
             return found
         return iter(sorted(found, key=lambda block: block.first_sample))
@@ -120,11 +126,12 @@ class Recording:
         """(sample, JSON) of every note of that kind, by sample; empty if there is none."""
         return tuple(self._notes.get(kind, ()))
 
-    def _blocks_in_file(self) -> Iterator[Block]:
+    def _blocks_in_file(self, from_sample: int) -> Iterator[Block]:
         for batch in self._batches():
-            rows = zip(batch.column("sample").to_pylist(), batch.column("block").to_pylist(), strict=True)
-            for sample, cell in rows:
-                yield self._block(sample, cell[0])
+            cells = batch.column("block")
+            for row, sample in enumerate(batch.column("sample").to_pylist()):
+                if sample >= from_sample:
+                    yield self._block(sample, cells[row].as_py()[0])
 
     def _batches(self) -> Iterator[pa.RecordBatch]:
         if self._held is not None:
@@ -209,7 +216,7 @@ def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
     for part in parts:
         for kind, rows in part._notes.items():
             notes.setdefault(kind, []).extend(rows)
-    index = tuple(sorted(row for part in parts for row in part.index))
+    marks = sorted((mark for part in parts for mark in part.marks), key=_first_sample)
     held = [part._held for part in parts]
     whole = replace(
         first,
@@ -222,9 +229,9 @@ def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
         finished=parts[-1].finished,
         _sources=tuple(s for part in parts for s in part._sources),
         _in_order=all(part._in_order for part in parts)
-        and all(a.index[-1:] <= b.index[:1] or not b.index for a, b in pairwise(parts)),
+        and all(a.end_sample <= b.marks[0].first_sample for a, b in pairwise(parts) if b.marks),
         _notes={kind: sorted(rows, key=lambda row: row[0]) for kind, rows in notes.items()},
-        _index=index,
+        _marks=tuple(marks),
         _held=None if None in held else tuple(batch for some in held if some is not None for batch in some),
     )
     # Repaired copies live as long as the recordings they were made for.
@@ -319,8 +326,7 @@ def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
     """One pass over the file: properties, notes, and where the blocks are."""
     properties: dict[str, str] = {}
     notes: dict[str, list[tuple[int, bytes, str]]] = {}
-    firsts: list[int] = []
-    lengths: list[int] = []
+    marks: list[Mark] = []
     held: list[pa.RecordBatch] | None = [] if hold_bytes > 0 else None
     for chunk in _stream(source):
         entity = chunk.entity_path
@@ -333,8 +339,7 @@ def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
             }
         elif entity == f"/{ROOT}/raw":
             batch = chunk.to_record_batch()
-            firsts += batch.column("sample").to_pylist()
-            lengths += batch.column("block").flatten().field("n_samples").to_pylist()
+            marks += _marks_in(batch)
             hold_bytes -= batch.nbytes
             if held is not None and hold_bytes >= 0:
                 held.append(batch)
@@ -355,19 +360,33 @@ def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
         parts=(path,),
         missing_parts=(),
         **known,
-        n_samples=sum(lengths),
-        n_blocks=len(firsts),
-        end_sample=max((f + n for f, n in zip(firsts, lengths, strict=True)), default=0),
+        n_samples=sum(mark.n_samples for mark in marks),
+        n_blocks=len(marks),
+        end_sample=max((mark.end_sample for mark in marks), default=0),
         repaired=source != path,
         finished=extent(path).finished,
         _run_id=properties.get("run_id", ""),
         _sources=(source,),
-        _in_order=all(a <= b for a, b in pairwise(firsts)),
+        _in_order=all(a.first_sample <= b.first_sample for a, b in pairwise(marks)),
         # Row ids count up as rows are written: they keep the order of notes at the same sample.
         _notes={kind: [(sample, text) for sample, _, text in sorted(rows)] for kind, rows in notes.items()},
-        _index=tuple(sorted(zip(firsts, lengths, strict=True))),
+        _marks=tuple(sorted(marks, key=_first_sample)),
         _held=None if held is None else tuple(held),
     )
+
+
+def _marks_in(batch: pa.RecordBatch) -> list[Mark]:
+    firsts, blocks = batch.column("sample").to_pylist(), batch.column("block").flatten()
+    names = ("n_samples", "config_id", "control_on", "commands_applied")
+    columns = [blocks.field(name).to_pylist() for name in names]
+    return [
+        Mark(first, n, config_id, on, tuple(applied))
+        for first, n, config_id, on, applied in zip(firsts, *columns, strict=True)
+    ]
+
+
+def _first_sample(mark: Mark) -> int:
+    return mark.first_sample
 
 
 def _parse(path: Path, properties: dict[str, str]) -> dict[str, Any]:

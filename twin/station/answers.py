@@ -110,6 +110,12 @@ class KnownAnswers:
             return None
 
 
+def software() -> dict[str, str]:
+    """Versions that a recording keeps."""
+    found = {name: version(name) for name in (*_NUMERIC_LIBRARIES, "rerun-sdk")}
+    return found | {"python": platform.python_version(), "machine": platform.machine(), "code_id": code_id()}
+
+
 NOTHING_KNOWN = KnownAnswers({})
 
 

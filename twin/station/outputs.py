@@ -12,6 +12,8 @@ import rerun as rr
 
 from twin.plant.errors import RunError
 from twin.rig.recording import APPLICATION, Recorder
+from twin.rig.storage import Storage, part_path, parts_beside
+from twin.station.answers import note, software
 from twin.station.frame import Frame
 from twin.station.live import LiveView, NativeViewer
 from twin.station.rerun_view import RerunView
@@ -30,17 +32,19 @@ def has_display() -> bool:
 
 
 def keep_existing(path: Path) -> Path | None:
-    """Move a file that is in the way aside, to the first free ``NAME.k.SUFFIX``; None if there was none.
+    """Move a run that is in the way aside, all its files, to the first free ``NAME.k.SUFFIX``; None if there was none.
 
     Nothing recorded is lost because a name was used twice.
     """
-    if not path.exists():
+    found = parts_beside(path)
+    if not found:
         return None
     k = 1
-    while (aside := path.with_name(f"{path.stem}.{k}{path.suffix}")).exists():
+    while parts_beside(aside := path.with_name(f"{path.stem}.{k}{path.suffix}")):
         k += 1
-    path.rename(aside)
-    return aside
+    for number, file in found.items():
+        file.rename(part_path(aside, number))
+    return part_path(aside, min(found))
 
 
 class Outputs:
@@ -60,6 +64,8 @@ class Outputs:
         Open Rerun's own viewer.
     web
         Serve Rerun's web viewer on this machine.
+    storage
+        When another file is begun, and how much all may take.
     """
 
     def __init__(
@@ -72,7 +78,9 @@ class Outputs:
         seed: int | None,
         window: bool = False,
         web: bool = False,
+        storage: Storage | None = None,
     ) -> None:
+        self._model: float | None = None
         self._session = session
         self._setup = setup
         self.recorder: Recorder | None = None
@@ -92,8 +100,10 @@ class Outputs:
                 channels=session.channels,
                 run_config_json=run_config_json,
                 seed=seed,
+                storage=storage,
+                software=software(),
             )
-            self._file_view = self._view(self.recorder.stream, hold_blocks=FILE_HOLD_BLOCKS, follow=False)
+            self._file_view = self._new_file_view(self.recorder)
         if web or window:
             stream = rr.RecordingStream(APPLICATION)
             if web:
@@ -105,6 +115,9 @@ class Outputs:
             self.live = LiveView(
                 self._view(stream, trend_s=LIVE_TREND_S), keep_stream=web, viewer=self._viewer
             )
+
+    def _new_file_view(self, recorder: Recorder) -> RerunView:
+        return self._view(recorder.stream, hold_blocks=FILE_HOLD_BLOCKS, follow=False)
 
     def _view(
         self,
@@ -137,8 +150,15 @@ class Outputs:
         """
         recorder = self.recorder
         if recorder is not None:
+            if self._file_view is not None and recorder.part_is_full(frame.block):
+                self._file_view.send()
+                recorder.next_part()
+                self._file_view = self._new_file_view(recorder)
             recorder.write_block(frame.block)
             sample = frame.block.end_sample - 1
+            if self._session.modelled_damping_ns_m != self._model:
+                self._model = self._session.modelled_damping_ns_m
+                recorder.write_note("models", sample, json.dumps({"damping_ns_m": self._model}))
             for command in frame.commands:
                 recorder.write_command(command)
             if frame.ordered is not None and frame.ordered.order is not None:
@@ -150,8 +170,8 @@ class Outputs:
             if frame.asked is not None:
                 recorder.write_note("questions", sample, json.dumps({"number": frame.asked}))
             if frame.arrival is not None:
-                taken = {"number": frame.arrival.number, "trouble": frame.arrival.trouble}
-                recorder.write_note("answers", sample, json.dumps(taken))
+                a = frame.arrival
+                recorder.write_note("answers", sample, note(a.number, a.trouble, a.chain, a.answer))
             if frame.audited is not None:
                 recorder.write_note("audit", frame.audited.sample, json.dumps(asdict(frame.audited)))
             for decision in frame.decisions:

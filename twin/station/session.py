@@ -186,6 +186,11 @@ class Session:
         """Commands of the run so far, by identifier; of the whole run where a recording is replayed."""
         return {} if self.retuning is None else self.retuning.commands
 
+    @property
+    def modelled_damping_ns_m(self) -> float:
+        """Damping of the absorber in the model that the observer goes by at present."""
+        return self._modelled_damping
+
     def warm_up(self) -> None:
         """Compile and load everything a block needs, on a throwaway twin of this session."""
         twin = Session(self.plant, self.channels, self.observer.sample_rate_hz, SessionSettings())
