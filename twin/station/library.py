@@ -221,6 +221,31 @@ def export_recording(
     )
 
 
+@recordings_app.command(
+    "smooth", epilog="Example: atmd recordings smooth runs/demo.rrd --out states.parquet --every 50"
+)
+def smooth(
+    file: FileArgument,
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", help="Its ending chooses: .csv, .parquet, .tdms, .npz, .mat."),
+    ],
+    every: Annotated[int, typer.Option(min=1, help="Keep one sample in so many.")] = 50,
+) -> None:
+    """Estimate every state from the whole recording, later samples included, each with its standard deviation.
+
+    Rauch-Tung-Striebel smoothing with the model that a replay identifies. Columns are the observer's states, such as
+    x_table, and x_table_std.
+    """
+    from twin.rig.writers import Series, write_series
+    from twin.station.smoothing import smooth_recording
+
+    with progress_bar("smooth") as progress:
+        channels, rate, blocks = smooth_recording(file, every, say, progress)
+    write_series(out, Series(channels, rate, lambda: iter(blocks)))
+    say(f"{out}: {', '.join(c.name for c in channels[::2])} with standard deviations, {rate:g} samples/s")
+
+
 def inspect(file: Path) -> Inspection:
     """Look at every block of a recording.
 
