@@ -17,6 +17,7 @@ KEYS: dict[str, tuple[str, str]] = {
     "budget_w": ("W", "coil power that may be spent"),
     "budget_kind": ("", f"which power that is: {', '.join(KINDS)}"),
     "power_price_um_w": ("µm/W", "spend a watt only where it buys at least so much less motion"),
+    "displacement_m": ("m", "motion that is enough: reached with the least power"),
     "modulus_margin": ("", "least distance of the loop gain from -1"),
     "low_pass_hz": ("Hz", "cutoff of the low-pass behind the accelerometers"),
     "high_pass_hz": ("Hz", "cutoff of both high-passes"),
@@ -39,6 +40,7 @@ class Changes:
     budget_w: float | None = None
     budget_kind: BudgetKind | None = None
     power_price_um_w: float | None = None
+    displacement_m: float | None = None
     modulus_margin: float | None = None
     low_pass_hz: float | None = None
     high_pass_hz: float | None = None
@@ -82,7 +84,7 @@ class Changes:
         """The goal with these changes."""
         found: dict[str, Any] = {
             name: getattr(self, name)
-            for name in ("budget_w", "budget_kind", "modulus_margin")
+            for name in ("budget_w", "budget_kind", "displacement_m", "modulus_margin")
             if getattr(self, name) is not None
         }
         return replace(goal, **found)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -150,7 +150,9 @@ def run_demo(
     with EmbeddedRig(programme, speed) as rig:
         # The rig starts up on another core while this process loads its solvers and viewer: seconds saved.
         from tuning.retune import TuningGoal
+        from twin.station.desk import Desk
         from twin.station.outputs import Outputs
+        from twin.station.page_server import OperatorPage
         from twin.station.retuning import RetuningSettings
         from twin.station.run import Loop
         from twin.station.worker import TunerProcess
@@ -180,15 +182,19 @@ def run_demo(
                 window=options.window,
                 web=options.web,
             ) as outputs,
+            ExitStack() as stack,
         ):
             if outputs.moved_aside is not None:
                 say(f"{options.recording} was there already; kept as {outputs.moved_aside}")
-            if outputs.url:
-                say(f"open {outputs.url}")
             session.warm_up()
             rig.connect()
             gateway = rig.gateway
-            loop = Loop(session, outputs, gateway)
+            desk: Desk | None = None
+            if options.web:
+                desk = Desk(session, gateway, unseen=lambda: outputs.frames_unseen, viewer_url=outputs.url)
+                page = stack.enter_context(OperatorPage(desk))
+                say(f"operator page: {page.url}")
+            loop = Loop(session, outputs, gateway, desk)
             log = loop.log
             try:
                 for block in rig.blocks():

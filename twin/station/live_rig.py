@@ -18,8 +18,11 @@ from twin.plant.files import load_plant
 from twin.rig.gateway import RigGateway
 from twin.rig.keys import load_pair, load_public
 from twin.rig.messages import Hello
+from twin.station.desk import Desk
 from twin.station.orders import Order
 from twin.station.outputs import Outputs
+from twin.station.page_server import OperatorPage
+from twin.station.panel import WireState
 from twin.station.retuning import RetuningSettings
 from twin.station.run import Loop
 from twin.station.session import Session, SessionSettings
@@ -38,8 +41,10 @@ class LiveOptions:
     ----------
     address
         ``tcp://HOST:PORT`` of the rig's samples; commands go to the next port.
-    page_bind, page_port
-        Where the operator page is served; None for no page.
+    bind, port
+        Where the operator page is served, if ``web``; port 0 takes a free one.
+    automatic
+        Send verified proposals at once; else they wait for the operator.
     seconds
         End after so much data; None goes on until Ctrl-C or the rig's end.
     """
@@ -95,7 +100,12 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
         if outputs.moved_aside is not None:
             say(f"{options.recording} was there already; kept as {outputs.moved_aside}")
         session.warm_up()
-        loop = Loop(session, outputs, gateway, remarks=_Remarks(gateway, say))
+        desk: Desk | None = None
+        if options.web:
+            desk = Desk(session, gateway, lambda: _wire_state(gateway), lambda: outputs.frames_unseen, outputs.url)
+            page = stack.enter_context(OperatorPage(desk, options.bind, options.port))
+            say(f"operator page: {page.url}")
+        loop = Loop(session, outputs, gateway, desk, _Remarks(gateway, say))
         error, interrupted = "", False
         gateway.start()
         say(f"connected: {_in_words(hello)}")
@@ -223,6 +233,20 @@ class _Silence:
         if seconds >= SILENT_S > self.seconds:
             self._say("the rig is silent; waiting for it, Ctrl-C ends")
         self.seconds = seconds
+
+
+def _wire_state(gateway: RigGateway) -> WireState:
+    c = gateway.counts
+    return WireState(
+        lost=c.lost,
+        late=c.late,
+        repeated=c.repeated,
+        reordered=c.reordered,
+        malformed=gateway.malformed,
+        restarts=gateway.restarts,
+        drift_ppm=_finite(gateway.drift.ppm),
+        notice=gateway.notice,
+    )
 
 
 def _finite(value: float) -> float | None:

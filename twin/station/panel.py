@@ -1,0 +1,205 @@
+"""What the operator page shows of a frame: plain data, finite, small, with what is wrong in words."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from tuning.retune import TuningGoal
+from tuning.types import Powers
+from twin.station.audit import AuditPoint
+from twin.station.frame import ROUTINE, Frame
+from twin.station.session import Session
+
+LOG_ROWS = 500
+TIGHT_SHARE = 0.7
+"""A loop that needs more of a block's time than this is near its end."""
+
+
+def finite(value: float | None, digits: int = 6) -> float | None:
+    """Rounded to so many significant digits; None where it is no number."""
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{value:.{digits}g}")
+
+
+@dataclass(frozen=True, slots=True)
+class WireState:
+    """What the wire is doing."""
+
+    lost: int = 0
+    late: int = 0
+    repeated: int = 0
+    reordered: int = 0
+    malformed: int = 0
+    restarts: int = 0
+    drift_ppm: float | None = None
+    notice: str = ""
+
+
+@dataclass(slots=True)
+class Panel:
+    """Turns frames into rows of the log and a dictionary that is replaced as a whole.
+
+    Attributes
+    ----------
+    state
+        The latest, see `take`; never changed once it is there.
+    log
+        Rows with rising ``seq``.
+    """
+
+    session: Session
+    state: dict[str, Any] = field(default_factory=dict)
+    log: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=LOG_ROWS))
+    _seq: int = 0
+    _sent: dict[str, Any] | None = None
+    _audit: AuditPoint | None = None
+
+    def take(self, frame: Frame, in_loop_s: float, wire: WireState, unseen: int) -> None:
+        """Show one frame."""
+        block, session = frame.block, self.session
+        retuning = session.retuning
+        self._note(frame)
+        if frame.audited is not None:
+            self._audit = frame.audited
+        goal = session.settings.goal if retuning is None else retuning.goal
+        length_s = block.n_samples / block.sample_rate_hz
+        learner = None
+        if frame.curve is not None and frame.phasors is not None:
+            learner = {
+                "status": frame.curve.status,
+                "progress": finite(frame.curve.progress),
+                "reason": frame.curve.reason,
+            }
+        self.state = {
+            "sample": block.end_sample,
+            "time_s": finite(block.end_s, 9),
+            "plant": session.plant.name,
+            "config_id": block.config_id or session.plant.fingerprint,
+            "model_id": session.identified_plant().fingerprint,
+            "wire": {name: getattr(wire, name) for name in WireState.__slots__},
+            "load": finite(in_loop_s / length_s, 3),
+            "unseen": unseen,
+            "health": {
+                "verdict": frame.health.verdict,
+                "channel": frame.health.channel,
+                "reason": frame.health.reason,
+            },
+            "learner": learner,
+            "control_on": block.control_on,
+            "excitation_hz": None if frame.phasors is None else finite(frame.phasors.frequency_hz),
+            "performance": self._performance(frame, goal),
+            "goal": goal_figures(goal),
+            "approve": None if retuning is None else retuning.approve,
+            "standing": self._standing(),
+            "can_revert": retuning is not None and retuning.can_revert,
+            "sent": self._sent,
+            "audit": None if self._audit is None else audit_figures(self._audit),
+            "alarms": self._alarms(frame, in_loop_s / length_s, wire, goal),
+        }
+
+    def _performance(self, frame: Frame, goal: TuningGoal) -> dict[str, Any] | None:
+        p = frame.performance
+        if p is None:
+            return None
+        return {
+            "displacement_m": finite(p.displacement_m),
+            "passive_m": finite(p.passive_m),
+            "limit_m": finite(p.limit_m),
+            "current_peak_a": finite(p.current_peak_a),
+            "power_w": finite(p.powers.of_kind(goal.budget_kind)),
+            **power_figures(p.powers),
+        }
+
+    def _standing(self) -> dict[str, Any] | None:
+        retuning = self.session.retuning
+        if retuning is None or not retuning.standing:
+            return None
+        number, standing = list(retuning.standing.items())[-1]
+        hz = [p.frequency_hz for _, p in standing.proposal.points]
+        return {"number": number, "from_hz": min(hz), "to_hz": max(hz), "points": len(standing.steps)}
+
+    def _alarms(self, frame: Frame, load: float, wire: WireState, goal: TuningGoal) -> list[str]:
+        found = []
+        if wire.notice:
+            found.append(f"Rig: {wire.notice}")
+        if frame.health.verdict in ("diverged", "no data"):
+            found.append(f"Model {frame.health.verdict}: {frame.health.reason}")
+        if load > TIGHT_SHARE:
+            found.append(f"The loop needs {100 * load:.0f} % of a block's time")
+        p = frame.performance
+        if p is not None and p.powers.of_kind(goal.budget_kind) > 1.1 * goal.budget_w:
+            found.append(f"Power {p.powers.of_kind(goal.budget_kind):.2f} W over the budget {goal.budget_w:g} W")
+        limit = self._current_limit()
+        if p is not None and p.current_peak_a > 0.98 * limit:
+            found.append(f"Coil current {p.current_peak_a:.2f} A at its limit {limit:g} A")
+        return found
+
+    def _current_limit(self) -> float:
+        plant = self.session.plant
+        coil = plant.voice_coil
+        return math.inf if coil is None else plant.limits.get(f"{coil.name}_current_a", math.inf)
+
+    def _note(self, frame: Frame) -> None:
+        block = frame.block
+        for event in frame.events:
+            self.add(event.sample / block.sample_rate_hz, event.level, event.text)
+        for d in frame.decisions:
+            if d.reason not in ROUTINE:
+                word = "taken" if d.accepted else "declined"
+                self.add(d.sample / block.sample_rate_hz, "decision", f"{word} ({d.by}): {d.reason}")
+        for command in frame.commands:
+            self._sent = {"command_id": command.command_id, "state": "sent", "due": command.apply_at_sample}
+            if command.schedule is not None:
+                self._audit = None
+        for answer in frame.acknowledgements:
+            at = answer.applied_at_sample
+            if answer.accepted:
+                words = f"command {answer.command_id} acknowledged at sample {at}"
+                self.add(block.start_s, "decision", words)
+            if self._sent is not None and self._sent["command_id"] == answer.command_id:
+                state = "acknowledged" if answer.accepted else "refused"
+                self._sent = {**self._sent, "state": state, "at_sample": at, "reason": answer.reason}
+
+    def add(self, time_s: float, level: str, text: str) -> None:
+        """Append a row, stamped with model and configuration."""
+        self._seq += 1
+        self.log.append({
+            "seq": self._seq,
+            "time_s": finite(time_s, 9),
+            "level": level,
+            "text": text,
+            "model_id": self.state.get("model_id", ""),
+            "config_id": self.state.get("config_id", ""),
+        })  # fmt: skip
+
+
+def goal_figures(goal: TuningGoal) -> dict[str, Any]:
+    """Return the goal, for the page."""
+    return {
+        "budget_w": goal.budget_w,
+        "budget_kind": goal.budget_kind,
+        "modulus_margin": goal.modulus_margin,
+        "displacement_m": goal.displacement_m,
+    }
+
+
+def power_figures(powers: Powers) -> dict[str, Any]:
+    """All three powers [W]."""
+    return {
+        "joule_mean_w": finite(powers.joule_mean_w),
+        "joule_peak_w": finite(powers.joule_peak_w),
+        "electrical_mean_w": finite(powers.electrical_mean_w),
+    }
+
+
+def audit_figures(point: AuditPoint) -> dict[str, Any]:
+    """Predicted beside achieved."""
+    return {
+        "sample": point.sample,
+        "frequency_hz": finite(point.frequency_hz),
+        "displacement_m": [finite(v) for v in point.displacement_m],
+        "joule_mean_w": [finite(v) for v in point.joule_mean_w],
+        "floor_m": finite(point.floor_m),
+    }
