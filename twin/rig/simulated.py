@@ -15,7 +15,7 @@ from twin.control.chain import CHAIN_STATES
 from twin.control.rig_block import rig_block
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
 from twin.plant.config import VoiceCoil
-from twin.plant.discrete import Hold, discretise
+from twin.plant.discrete import DiscreteModel, Hold, discretise
 from twin.plant.linear import Array, LinearModel, linear_model, read_only
 from twin.rig.excitation import Span
 from twin.rig.programme import Programme, rig_channels
@@ -156,7 +156,7 @@ class SimulatedRig:
         on = self.control_enabled and not self.tripped and self.schedule.acts_at(middle)
         model = self._model(middle)
         fs = self.programme.sample_rate_hz
-        discrete = discretise(model, fs, self._holds)
+        discrete = self._stepping(model, middle)
         x_before, u_before = self._x.copy(), self._u_before.copy()
         states = np.empty((len(drive) if self._keep_truth else 0, len(self._x)))
         stroke = rig_block(
@@ -229,6 +229,10 @@ class SimulatedRig:
 
     def _model(self, frequency_hz: float) -> LinearModel:
         return linear_model(self._plant, frequency_hz=frequency_hz)
+
+    def _stepping(self, model: LinearModel, frequency_hz: float) -> DiscreteModel:
+        """The plant for stepping sample by sample; the frequency is where the model's damping was read [Hz]."""
+        return discretise(model, self.programme.sample_rate_hz, self._holds)
 
     def _kick(self, model: LinearModel) -> Array:
         """State change per newton held over one sample on the primary body."""

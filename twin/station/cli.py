@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from twin.plant.errors import InputError, RunError
+from twin.station.campaign.command import campaign
 from twin.station.fit import fit_app
 from twin.station.library import recordings_app
 from twin.station.terminal import (
@@ -38,6 +39,9 @@ app = typer.Typer(
 
 app.add_typer(recordings_app)
 app.add_typer(fit_app, name="fit")
+app.command(
+    epilog="Example: atmd campaign docs/examples/campaign.toml   ·   atmd campaign docs/examples/campaign.toml --replay 17"
+)(campaign)
 
 
 class ControllerName(StrEnum):

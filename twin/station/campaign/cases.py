@@ -20,8 +20,8 @@ from tuning.campaign.scatter import (
     LOOP_DELAY,
     check_parameter,
     draw_factors,
-    nominal,
     noise_seed,
+    nominal,
     scattered_plant,
 )
 from tuning.loop import LoopFacts, loop_facts
