@@ -40,7 +40,8 @@ app = typer.Typer(
 app.add_typer(recordings_app)
 app.add_typer(fit_app, name="fit")
 app.command(
-    epilog="Example: atmd campaign docs/examples/campaign.toml   ·   atmd campaign docs/examples/campaign.toml --replay 17"
+    epilog="Examples: atmd campaign docs/examples/campaign.toml   ·   "
+    "atmd campaign docs/examples/campaign.toml --replay 17"
 )(campaign)
 
 
@@ -170,10 +171,11 @@ def demo(
     Attenuation is against the same rig without control. JSON keys: attenuation_mean, attenuation_worst (1 is perfect),
     current_peak_a, joule_mean_w, joule_peak_w, electrical_mean_w (largest of any 100 ms), budget_w, budget_kind,
     damping_rmse_ns_m (learned against true, 45 to 55 Hz), blocks, dropped, realtime_factor (time of data over time
-    in the loop), audit (promised against achieved: points, displacement_error_rms, power_error_rms and the worst, as
-    shares), outdated_proposals, recording, picture. With --test 1 the twin keeps to the thesis's gains until the rig
-    shows that they are unstable, then retunes once; key instability: from_hz, growth_1_s at growth_at_hz, explained,
-    removed_by_command, displacement before and after.
+    in the loop), estimation (what learner, health monitor and tracker say in the end), audit (promised against
+    achieved: points, displacement_error_rms, power_error_rms and the worst, as shares), outdated_proposals, recording,
+    picture. With --test 1 the twin keeps to the thesis's gains until the rig shows that they are unstable, then
+    retunes once; key instability: from_hz, growth_1_s at growth_at_hz, explained, removed_by_command, displacement
+    before and after.
     """
     from twin.station.demo import SWEEP_HZ, DemoOptions, run_demo
     from twin.station.outputs import has_display
@@ -184,7 +186,9 @@ def demo(
     window = not headless and not web and has_display()
     if test not in (1, 3):
         raise InputError(f"--test {test}: the demo knows tests 1 and 3; the others are among the recordings")
-    options = DemoOptions(seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3, learned)
+    options = DemoOptions(
+        seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3, learned
+    )
     say(
         f"Simulated rig, thesis Test {test}: {SWEEP_HZ[0]:g} to {SWEEP_HZ[1]:g} Hz in {seconds:g} s; "
         f"recording to {recording}"
@@ -773,6 +777,7 @@ def _demo_table(r: dict[str, Any]) -> Table:
     table.add_row(
         "damping c2(f), learned - true", with_unit(r["damping_rmse_ns_m"], "Ns/m"), "rms, 45 to 55 Hz"
     )
+    _add_estimation(table, r["estimation"])
     table.add_row("blocks, dropped", f"{r['blocks']}, {r['dropped']}", f"{r['commands']} commands obeyed")
     table.add_row("real-time factor", number(r["realtime_factor"]), "time of data / time in the loop")
     audit, instability = r["audit"], r["instability"]
@@ -809,6 +814,20 @@ def _live_table(r: dict[str, Any]) -> Table:
     return table
 
 
+def _add_estimation(table: Table, e: dict[str, Any]) -> None:
+    """What the estimators say of themselves."""
+    if e["learner_status"] is not None:
+        table.add_row("damping learned", percent(e["learner_progress"]), e["learner_status"])
+    if e["stiffness_n_m"] is not None and e["stiffness_std_n_m"] is not None:
+        stiffness = f"{e['stiffness_n_m']:.0f} ± {e['stiffness_std_n_m']:.0f} N/m"
+        table.add_row("absorber stiffness", stiffness, "from the same force balance")
+    if e["force_n"] is not None:
+        table.add_row(
+            "exciting force", f"{e['force_n']:.4g} ± {e['force_std_n']:.2g} N", "not measured: estimated"
+        )
+    table.add_row("model and rig consistent", percent(e["consistent_share"]), "of the run")
+
+
 def _replay_table(r: dict[str, Any]) -> Table:
     table = Table("figure", "value", "", title=f"Replay of {r['file']}", title_justify="left")
     table.add_row("plant", r["plant"], f"{r['sample_rate_hz']:g} samples/s")
@@ -817,6 +836,7 @@ def _replay_table(r: dict[str, Any]) -> Table:
         without = s["nrmse_without_input"]
         remark = f"without the known input {without:.4f}" if without is not None else ""
         table.add_row(f"NRMSE {s['sensor']}", f"{s['nrmse']:.4f}", f"{remark} ({s['rows']} rows)")
+    _add_estimation(table, r["estimation"])
     if r["attenuation_mean"] is not None:
         table.add_row("mean attenuation", percent(r["attenuation_mean"]), "against the model without control")
     if r["joule_mean_w"] is not None:

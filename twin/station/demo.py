@@ -211,6 +211,7 @@ def run_demo(
             passive = passive_displacement(programme, log.blocks)
             result = {
                 **log.figures(passive, programme.true_damping),
+                "estimation": log.estimation(),
                 "budget_w": goal.budget_w,
                 "budget_kind": goal.budget_kind,
                 "dropped": dropped,

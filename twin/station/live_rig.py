@@ -119,6 +119,7 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
         counts = gateway.counts
         result = {
             **loop.log.figures(),
+            "estimation": loop.log.estimation(),
             "rig": options.address,
             "plant": plant.name,
             "budget_w": options.goal.budget_w,

@@ -41,6 +41,9 @@ class RunLog:
     outdated: int = 0
     audit: Audit = field(default_factory=Audit)
     instability: InstabilityLog = field(default_factory=InstabilityLog)
+    consistent: int = 0
+    distortion: list[float] = field(default_factory=list)
+    force_n: tuple[float, float] | None = None
     _on_for_s: float = 0.0
 
     def add(self, frame: Frame) -> None:
@@ -58,6 +61,11 @@ class RunLog:
         if frame.audited is not None:
             self.audit.points.append(frame.audited)
         self.curve = frame.curve or self.curve
+        self.consistent += frame.health is not None and frame.health.verdict == "consistent"
+        if frame.phasors is not None:
+            thd, _ = frame.phasors.distortion()
+            self.distortion.append(float(thd[frame.phasors.channels.index(frame.phasors.reference)]))
+        self.force_n = frame.force_n or self.force_n
         self._on_for_s = self._on_for_s + block.n_samples / block.sample_rate_hz if block.control_on else 0.0
         self.nis.append(frame.estimate.nis)
         p = frame.performance
@@ -112,12 +120,31 @@ class RunLog:
             "instability": self.instability.figures(),
         }
 
+    def estimation(self) -> dict[str, Any]:
+        """What the estimators say of themselves at the end, by name; None where there is no such part."""
+        curve, force = self.curve, self.force_n
+        return {
+            "consistent_share": self.consistent / self.blocks if self.blocks else None,
+            "excitation_distortion_median": _median(self.distortion),
+            "force_n": None if force is None else force[0],
+            "force_std_n": None if force is None else force[1],
+            "learner_status": None if curve is None else curve.status,
+            "learner_progress": None if curve is None else curve.progress,
+            "learner_reason": None if curve is None else curve.reason,
+            "stiffness_n_m": None if curve is None else _finite(curve.stiffness_n_m),
+            "stiffness_std_n_m": None if curve is None else _finite(curve.stiffness_std_n_m),
+        }
+
 
 def damping_rmse(curve: DampingCurve, truth: DampingTable) -> float:
     """Root mean square of learned minus true damping over the band [Ns/m]."""
     f = np.linspace(*BAND_HZ, 101)
     learned = np.interp(f, curve.frequency_hz, curve.damping_ns_m)
     return float(np.sqrt(np.mean((learned - np.array([truth.at(x) for x in f])) ** 2)))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _largest(values: list[float]) -> float | None:
