@@ -191,6 +191,12 @@ class Session:
         """Damping of the absorber in the model that the observer goes by at present."""
         return self._modelled_damping
 
+    @property
+    def answers_worked_out(self) -> int | None:
+        """Answers of a replay's tuner that were not taken from the recording; None where there is no such tuner."""
+        tuner = None if self.retuning is None else self.retuning.tuner
+        return tuner.worked_out if isinstance(tuner, TunerHere) else None
+
     def warm_up(self) -> None:
         """Compile and load everything a block needs, on a throwaway twin of this session."""
         twin = Session(self.plant, self.channels, self.observer.sample_rate_hz, SessionSettings())
