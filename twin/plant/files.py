@@ -20,9 +20,12 @@ _UNITS = {
     "_w": "W", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
 
-_LISTS = ("body", "actuator", "sensor", "fitted_on")
+_LISTS = ("body", "actuator", "sensor", "fitted_on", "excitation", "scatter")
 # Words that pydantic puts into the path of an error for the chosen form of a value.
-_FORMS = ("voice_coil", "shaker", "force", "number", "table", "one", "pair")
+_FORMS = (
+    "voice_coil", "shaker", "force", "number", "table", "one", "pair", "uniform", "normal", "log_normal", "thesis",
+    "retuned", "from_file", "sweep", "steps", "tone", "shuttle",
+)  # fmt: skip
 
 
 def load_plant(name_or_path: str | Path) -> Plant:
@@ -177,10 +180,13 @@ def _explain(problem: Any, data: dict[str, Any]) -> str:
             return f"{label}: must be one of {context['expected'].replace(' or ', ', ')}{got}"
         case "value_error":
             return f"{label}: {context['error']}" if place else str(context["error"])
-        case "union_tag_not_found":
+        case "union_tag_not_found" if place.startswith("actuator"):
             return f"{place}: kind is missing; use one of 'voice_coil', 'shaker', 'force'"
+        case "union_tag_not_found":
+            return f"{place}: {context['discriminator'].strip(chr(39))} is missing; add it"
         case "union_tag_invalid":
-            return f"{place}: kind must be one of {context['expected_tags']}, got {context['tag']!r}"
+            told_by = context["discriminator"].strip("'")
+            return f"{place}: {told_by} must be one of {context['expected_tags']}, got {context['tag']!r}"
         case "string_pattern_mismatch" if key == "recorded_as":
             return f'{label}: must be "array", "array:unit" or "array[:,2]:unit"{got}'
         case "string_pattern_mismatch":

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tuning.campaign.statistics import DRAWN
 from twin.plant.errors import RunError
 from twin.station.campaign.spec import CampaignSpec
 from twin.station.validation.canvas import CONTROLLED, LIMIT, PASSIVE, SECOND, SHADES, dress
@@ -82,7 +81,7 @@ def _yield_figure(spec: CampaignSpec, result: dict[str, Any]) -> Figure:
 
 
 def _cases_figure(rows: Sequence[dict[str, Any]]) -> Figure:
-    """Attenuation of all cases, the mean against the worst, and what was broken first."""
+    """Motion left of all cases, the mean against the worst, and what was broken first."""
     figure = _figure(11.0, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
     groups = (
@@ -93,10 +92,11 @@ def _cases_figure(rows: Sequence[dict[str, Any]]) -> Figure:
     for label, colour, some in groups:
         known = [r for r in some if r["attenuation_worst"] is not None]
         if known:
-            x = [100.0 * r["attenuation_mean"] for r in known]
-            y = [100.0 * r["attenuation_worst"] for r in known]
-            left.plot(x, y, ".", color=colour, ms=5, alpha=0.6, label=f"{label} ({len(some)})")
-    dress(left, "mean attenuation [%]", "worst attenuation [%]", "Every case")
+            # What is left, not what is gone: an unstable case may move many times as far as the passive rig.
+            x = [100.0 * max(1.0 - r["attenuation_mean"], 1e-6) for r in known]
+            y = [100.0 * max(1.0 - r["attenuation_worst"], 1e-6) for r in known]
+            left.loglog(x, y, ".", color=colour, ms=5, alpha=0.6, label=f"{label} ({len(some)})")
+    dress(left, "mean motion left [% of passive]", "worst motion left [% of passive]", "Every case")
     counts: dict[str, int] = {}
     for row in rows:
         name = row["first_limit"] or "none"
@@ -169,7 +169,3 @@ whole grid. Results of every case are in <code>cases.parquet</code> beside this 
 <h2>What was asked</h2><pre>{described}</pre></body></html>
 """
 
-
-def parameters_of(row: dict[str, Any]) -> dict[str, float]:
-    """What was drawn for a case."""
-    return {key.removeprefix(DRAWN): value for key, value in row.items() if key.startswith(DRAWN)}

@@ -56,7 +56,7 @@ class Retuned(Frozen):
 class FromFile(Frozen):
     """A schedule that was handed over: the JSON of ``atmd tune`` or of ``atmd export``, or a recording's last."""
 
-    kind: Literal["file"]
+    kind: Literal["from_file"]
     file: str
 
 
@@ -124,7 +124,7 @@ class CampaignSpec(Frozen):
         if not self.excitation:
             raise ValueError("excitation: missing; add at least one [[excitation]], or [archive] with recordings")
         if self.schedule is None:
-            raise ValueError('schedule: missing; add [schedule] with kind = "thesis", "retuned" or "file"')
+            raise ValueError('schedule: missing; add [schedule] with kind = "thesis", "retuned" or "from_file"')
         if isinstance(self.schedule, Retuned) and not self.budgets_w:
             raise ValueError("budgets_w [W]: missing; the tuner needs a budget to retune within")
         names = [s.parameter for s in self.scatter]
