@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import chain, filters, observer, plant, retune
+from benchmarks import chain, filters, observer, plant, replay, retune
 from benchmarks.report import Report
 
 CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
@@ -11,6 +11,7 @@ CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
     "plant": (plant.run_plant, plant.Setting(), plant.SMALL),
     "filters": (filters.run_filters, filters.Setting(), filters.SMALL),
     "chain": (chain.run_chain, chain.Setting(), chain.SMALL),
+    "replay": (replay.run_replays, replay.Setting(), replay.SMALL),
     "retune": (retune.run_retune, retune.Setting(), retune.SMALL),
 }
 

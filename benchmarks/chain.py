@@ -145,7 +145,7 @@ def run_chain(setting: Setting) -> Report:
     figures["stage_share_of_real_time"]["recording and view"] = max(view, 0.0)
     for name, share in figures["stage_share_of_real_time"].items():
         rows.append(Row(f"  of a second of data: {name}", 1e3 * share, "ms"))
-    own, baseline = _baseline(programme, blocks[-1], sessions["full"], setting.baseline_samples)
+    own, baseline = baseline_factors(programme, blocks[-1], sessions["full"], setting.baseline_samples)
     figures["realtime_factor_filterpy_scipy"] = baseline
     figures["observer_and_plant_speedup_vs_filterpy_scipy"] = own / baseline
     rows.append(Row("plant and observer by dlsim and filterpy", baseline, "x"))
@@ -175,7 +175,7 @@ def _watch(session: Session) -> dict[str, float]:
     return total
 
 
-def _baseline(programme: Programme, block: Block, session: Session, samples: int) -> tuple[float, float]:
+def baseline_factors(programme: Programme, block: Block, session: Session, samples: int) -> tuple[float, float]:
     """Real-time factors of plant and observer: the program's own, then `dlsim` and filterpy sample by sample."""
     names = tuple(c.name for c in session.channels)
     observer = full_observer(programme, session)

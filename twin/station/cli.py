@@ -98,6 +98,20 @@ class BudgetName(StrEnum):
     ELECTRICAL = "electrical"
 
 
+RotateOption = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE|TIME", help="Go on in another file after 500MB, 10min, or 500MB,10min."),
+]
+DiskBudgetOption = Annotated[
+    str | None,
+    typer.Option("--disk-budget", metavar="SIZE", help="All files of the recording together, such as 20GB."),
+]
+DropOldestOption = Annotated[
+    bool,
+    typer.Option("--drop-oldest", help="Remove the oldest files when there is no room; else recording stops."),
+]
+
+
 class Interrupted(BaseException):
     """The person pressed Ctrl-C. Its own kind: the command-line library ends silently on KeyboardInterrupt."""
 
@@ -163,6 +177,9 @@ def demo(
             help="Go on from the damping learned there, if the file exists; kept there in the end.",
         ),
     ] = None,
+    rotate: RotateOption = None,
+    disk_budget: DiskBudgetOption = None,
+    drop_oldest: DropOldestOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Run a simulated rig in a process of its own with the twin beside it: thesis Test 3, retuned as it runs.
@@ -177,6 +194,7 @@ def demo(
     retunes once; key instability: from_hz, growth_1_s at growth_at_hz, explained, removed_by_command, displacement
     before and after.
     """
+    from twin.rig.storage import storage
     from twin.station.demo import SWEEP_HZ, DemoOptions, run_demo
     from twin.station.outputs import has_display
 
@@ -187,8 +205,9 @@ def demo(
     if test not in (1, 3):
         raise InputError(f"--test {test}: the demo knows tests 1 and 3; the others are among the recordings")
     options = DemoOptions(
-        seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3, learned
-    )
+        seconds, seed, budget_w, recording, window, web, speed, 1 if test == 1 else 3, learned,
+        storage(rotate, disk_budget, drop_oldest=drop_oldest),
+    )  # fmt: skip
     say(
         f"Simulated rig, thesis Test {test}: {SWEEP_HZ[0]:g} to {SWEEP_HZ[1]:g} Hz in {seconds:g} s; "
         f"recording to {recording}"
@@ -233,6 +252,26 @@ def replay(
     web: Annotated[
         bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
     ] = False,
+    from_s: Annotated[
+        float, typer.Option("--from", min=0.0, metavar="S", help="Show from here on; what lies before is played unseen.")
+    ] = 0.0,
+    to_s: Annotated[float | None, typer.Option("--to", min=0.0, metavar="S", help="End here.")] = None,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="1 keeps the time of the data, 0 goes as fast as it can.")
+    ] = 0.0,
+    recompute: Annotated[
+        bool,
+        typer.Option(
+            "--recompute", help="Work the tuner's answers out again, also where question and program are the same."
+        ),
+    ] = False,
+    block_ms: Annotated[
+        float | None,
+        typer.Option(min=1e-3, metavar="MS", help="Read in pieces of this size; results are the same to the bit."),
+    ] = None,
+    rotate: RotateOption = None,
+    disk_budget: DiskBudgetOption = None,
+    drop_oldest: DropOldestOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Run the same loop on a recording, as fast as it goes.
@@ -240,9 +279,12 @@ def replay(
     Reports how well the observer predicts each sensor one step ahead, as rms(error)/std(signal) on rows that the
     plant's parameters were not fitted on, with the known input and without; for rigs with a voice coil also
     attenuation (against the model's passive motion), powers, and whether the decisions of the run are repeated.
+    To go on from an instant with other gains or parameters: atmd whatif FILE --at S --set KEY=VALUE.
     JSON keys: nrmse, nrmse_without_input, sensors, blocks, samples, masked_samples, realtime_factor,
-    decisions_repeated, and those of the demo.
+    decisions_repeated, answers_recomputed (of the tuner; the others were recorded for the very same questions by the
+    very same program), and those of the demo.
     """
+    from twin.rig.storage import storage
     from twin.station.outputs import has_display
     from twin.station.replay import ReplayOptions, run_replay
 
@@ -252,7 +294,23 @@ def replay(
         raise InputError(
             "--view: this machine has no display; use --web, or --save FILE.rrd and open that elsewhere"
         )
-    options = ReplayOptions(plant, _channel_options(channel or []), sample_rate, sidecar, save, view, web)
+    if to_s is not None and to_s <= from_s:
+        raise InputError(f"--from {from_s:g} --to {to_s:g}: there is nothing between; give a later end, in s")
+    options = ReplayOptions(
+        plant=plant,
+        channels=_channel_options(channel or []),
+        sample_rate_hz=sample_rate,
+        sidecar=sidecar,
+        recording=save,
+        window=view,
+        web=web,
+        storage=storage(rotate, disk_budget, drop_oldest=drop_oldest),
+        recompute=recompute,
+        piece_s=None if block_ms is None else 1e-3 * block_ms,
+        from_s=from_s,
+        to_s=to_s,
+        speed=speed,
+    )
     with progress_bar("replay") as progress:
         result = run_replay(file, options, say, progress, _wait_for_browser if web else None)
     report(result, _replay_table, json_to)
@@ -453,6 +511,9 @@ def live(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="End after so much data, in s; else at Ctrl-C.")
     ] = None,
+    rotate: RotateOption = None,
+    disk_budget: DiskBudgetOption = None,
+    drop_oldest: DropOldestOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Run the twin beside a rig: watch, learn, propose, and send what the operator accepts, until Ctrl-C.
@@ -462,6 +523,7 @@ def live(
     lost, late, repeated, reordered, malformed, restarts, clock_drift_ppm, interrupted.
     """
     from tuning.retune import TuningGoal
+    from twin.rig.storage import storage
     from twin.station.live_rig import LiveEnd, LiveOptions, run_live
 
     _must_be_rrd(save)
@@ -474,6 +536,7 @@ def live(
     options = LiveOptions(
         address, plant, keys, rig, TuningGoal(budget_w=budget_w, budget_kind=budget.value),
         save if save is not None else Path("runs") / "live.rrd", web, view, bind, port, automatic, seconds,
+        storage(rotate, disk_budget, drop_oldest=drop_oldest),
     )  # fmt: skip
     signal.signal(signal.SIGINT, end)
     try:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +18,7 @@ from twin.plant.files import load_plant
 from twin.plant.linear import Array
 from twin.rig.embedded import EmbeddedRig
 from twin.rig.programme import Programme, Sweep
+from twin.rig.storage import Storage
 from twin.rig.tests_of_chapter_7 import programme as thesis_programme
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ class DemoOptions:
     speed: float | None = None
     test: Literal[1, 3] = 3
     learned: Path | None = None
+    storage: Storage = field(default_factory=Storage)
 
 
 GROWTH_SEEN_1_S = 0.3
@@ -174,6 +176,7 @@ def run_demo(
             Outputs(
                 session,
                 recording=options.recording,
+                storage=options.storage,
                 setup=setup,
                 run_config_json=json.dumps(
                     {"programme": programme.model_dump(mode="json"), "session": session.configuration()}

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from twin.plant.files import load_plant
 from twin.rig.gateway import RigGateway
 from twin.rig.keys import load_pair, load_public
 from twin.rig.messages import Hello
+from twin.rig.storage import Storage
 from twin.station.desk import Desk
 from twin.station.orders import Order
 from twin.station.outputs import Outputs
@@ -61,6 +62,7 @@ class LiveOptions:
     port: int = 0
     automatic: bool = False
     seconds: float | None = None
+    storage: Storage = field(default_factory=Storage)
 
 
 class LiveEnd(BaseException):
@@ -189,6 +191,7 @@ def _outputs(session: Session, hello: Hello, options: LiveOptions) -> Outputs:
     return Outputs(
         session,
         recording=options.recording,
+        storage=options.storage,
         setup=f"# Live rig\n\n{_in_words(hello)}",
         run_config_json=json.dumps(config),
         seed=None,
