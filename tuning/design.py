@@ -102,14 +102,15 @@ class Designer:
         conditions, unit = self._conditions(situation, cutoffs_hz, demands, kind)
         left = abs(situation.paths.motion[0] * wish_a + situation.paths.motion[1]) / unit
         enough = 0.0 if kind is not None else left**2 * (1.0 + 2.0 * NEXT_TO_LIMIT) + NEXT_TO_LIMIT**2
-        terms = situation.design_terms(cutoffs_hz)
+        grid = situation.design_grid
+        terms = situation.loop_terms(grid, cutoffs_hz)
         margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
         first: list[Array] | None = None
         for _ in range(TIGHTENINGS):
-            stability = self._stability(situation, cutoffs_hz, demands, terms, margin, late)
+            stability = self._stability(situation, grid, cutoffs_hz, demands, terms, margin, late)
             search = GainSearch(self._scale, self._bounds, conditions, stability, unit, enough)
             if first is None:
-                curves = [terms[0], *self._late(situation, terms[0], demands)]
+                curves = [terms[0], *self._late(grid, terms[0], demands)]
                 first = self._starts(conditions[0], wish_a, curves, margin)
             found = self._best(search, first)
             alpha, beta, gamma = (float(x) for x in found.numbers)
@@ -132,8 +133,8 @@ class Designer:
         self, situation: Situation, cutoffs_hz: tuple[float, float], demands: Demands, kind: BudgetKind | None
     ) -> tuple[list[Condition], float]:
         out = []
-        for k, (model, paths) in enumerate(situation.cases):
-            law = model.paths(paths.frequency_hz, *cutoffs_hz)[0]
+        laws = situation.laws(cutoffs_hz)
+        for k, (law, (_, paths)) in enumerate(zip(laws, situation.cases, strict=True)):
             bounds = [_tighter(d) for d in discs(paths, demands.limits)]
             if k == 0 and demands.displacement_m is not None:
                 bounds.append(_tighter(Disc("displacement", *paths.motion, demands.displacement_m)))
@@ -148,6 +149,7 @@ class Designer:
     def _stability(
         self,
         situation: Situation,
+        grid: Array,
         cutoffs_hz: tuple[float, float],
         demands: Demands,
         terms: list[ComplexArray],
@@ -155,10 +157,10 @@ class Designer:
         late: float,
     ) -> Stability:
         curves, least = list(terms), [margin] * len(terms)
-        delayed = self._late(situation, terms[0], demands)
+        delayed = self._late(grid, terms[0], demands)
         curves += delayed
         least += [min(late, 0.5 + 0.5 * margin)] * len(delayed)
-        n = len(situation.design_grid)
+        n = len(grid)
         first = np.zeros(n * len(curves), dtype=np.bool_)
         first[::n] = True
         # Less damping is what makes a loop slow: of the models the one with the least of it.
@@ -168,11 +170,11 @@ class Designer:
         return Stability(np.vstack(curves), np.repeat(least, n), first, decaying, wanted, cutoffs_hz)
 
     @staticmethod
-    def _late(situation: Situation, terms: ComplexArray, demands: Demands) -> list[ComplexArray]:
+    def _late(grid: Array, terms: ComplexArray, demands: Demands) -> list[ComplexArray]:
         """The loop with parts of the further delay that it must stand, and with all of it."""
         if demands.delay_margin_s == 0.0:
             return []
-        turn = -2j * np.pi * situation.design_grid * demands.delay_margin_s
+        turn = -2j * np.pi * grid * demands.delay_margin_s
         return [terms * np.exp(turn * share)[:, None] for share in DELAYS]
 
     def _starts(

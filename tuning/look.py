@@ -222,5 +222,7 @@ def look_at_limits(
             bend = quantity.conjugate() * slope[k] * second[c]
             for a in range(3):
                 for b in range(3):
-                    across = ((per * law[c, a]).conjugate() * per * law[c, b]).real - slopes[k, a] * slopes[k, b]
+                    across = ((per * law[c, a]).conjugate() * per * law[c, b]).real - slopes[k, a] * slopes[
+                        k, b
+                    ]
                     hessian[a, b] += weights[j] / size * (across + (bend * law[c, a] * law[c, b]).real)

@@ -15,6 +15,7 @@ from scipy.linalg.lapack import dgeev
 
 from twin.control.chain import CHAIN_STATES, chain_matrices, chain_response
 from twin.control.schedule import Gains
+from twin.plant.compiled import kernel
 from twin.plant.config import Plant, Shaker
 from twin.plant.discrete import DiscreteModel, discretise
 from twin.plant.errors import RunError
@@ -22,6 +23,9 @@ from twin.plant.linear import Array, ComplexArray, LinearModel, linear_model
 
 WELL_CONDITIONED = 1e9
 """Eigenvectors worse than this are not trusted for responses; the state equation is then solved point by point."""
+
+CLOSED_LOOP = 0.02
+"""Half-width of a mode, as a share of its frequency, that gains may sharpen it to: grids are no coarser around it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +299,9 @@ class RigModel:
         _, enters, commands = self._opened(gains.low_pass_hz, gains.high_pass_hz)
         real, imaginary, left, right, failed = dgeev(self.closed_loop_matrix(gains))
         if failed:
-            raise RunError("the closed loop's poles could not be computed: its matrix is not finite or too large")
+            raise RunError(
+                "the closed loop's poles could not be computed: its matrix is not finite or too large"
+            )
         poles = real + 1j * imaginary
         order = np.argsort(-np.abs(poles), kind="stable")
         chosen = [int(j) for j in order if imaginary[j] >= 0.0][:count]
@@ -364,19 +370,40 @@ def loop_margins(L: ComplexArray, frequency_hz: Array, longest_delay_s: float = 
     frequency_hz
         (n,) ascending [Hz].
     """
-    # Least distance from -1 to the chords between the grid's points, not to the points alone.
-    chord = np.diff(L)
-    along = -(chord.conj() * (1.0 + L[:-1])).real / np.maximum(np.abs(chord) ** 2, 1e-300)
-    modulus = float(np.min(np.abs(1.0 + L[:-1] + np.clip(along, 0.0, 1.0) * chord)))
-    size = np.abs(L) - 1.0
-    crossing = np.nonzero(size[:-1] * size[1:] < 0.0)[0]
-    best = math.inf
-    for k in crossing:
-        share = size[k] / (size[k] - size[k + 1])
-        f = frequency_hz[k] + share * (frequency_hz[k + 1] - frequency_hz[k])
-        angle = np.angle(L[k] + share * (L[k + 1] - L[k])) + math.pi
-        best = min(best, float(angle % math.tau) / (math.tau * f))
-    return Margins(modulus, best if best < longest_delay_s else None)
+    modulus, delay_s = nearest_and_soonest(np.ascontiguousarray(L), np.asarray(frequency_hz, np.float64))
+    return Margins(float(modulus), float(delay_s) if delay_s < longest_delay_s else None)
+
+
+@kernel
+def nearest_and_soonest(L: ComplexArray, frequency_hz: Array) -> tuple[float, float]:
+    """Least distance from -1 to the chords between a grid's points, and the least delay [s] that reaches -1.
+
+    Parameters
+    ----------
+    L, frequency_hz
+        As `loop_margins`.
+
+    Returns
+    -------
+    tuple of float
+        The delay is infinite where the loop gain never crosses one.
+    """
+    nearest, soonest = np.inf, np.inf
+    for k in range(len(L) - 1):
+        chord = L[k + 1] - L[k]
+        away = 1.0 + L[k]
+        length = chord.real * chord.real + chord.imag * chord.imag
+        along = -(chord.real * away.real + chord.imag * away.imag) / max(length, 1e-300)
+        point = away + min(max(along, 0.0), 1.0) * chord
+        nearest = min(nearest, np.sqrt(point.real * point.real + point.imag * point.imag))
+        before, after = np.abs(L[k]) - 1.0, np.abs(L[k + 1]) - 1.0
+        if before * after < 0.0:
+            share = before / (before - after)
+            f = frequency_hz[k] + share * (frequency_hz[k + 1] - frequency_hz[k])
+            crossing = L[k] + share * chord
+            angle = np.arctan2(crossing.imag, crossing.real) + np.pi
+            soonest = min(soonest, (angle % (2.0 * np.pi)) / (2.0 * np.pi * f))
+    return nearest, soonest
 
 
 def mode_grid(model: RigModel, points: int) -> Array:
@@ -389,7 +416,7 @@ def mode_grid(model: RigModel, points: int) -> Array:
     """
     parts = [np.geomspace(0.3, 0.49 * model.facts.sample_rate_hz, 3 * points)]
     for frequency, width in model.modes_hz:
-        off = np.geomspace(0.1 * min(width, frequency), 0.6 * frequency, points)
+        off = np.geomspace(0.1 * min(width, CLOSED_LOOP * frequency), 0.6 * frequency, points)
         parts += [frequency + off, frequency - off, np.array([frequency])]
     grid = np.unique(np.concatenate(parts))
     return grid[(grid > 0.0) & (grid < 0.495 * model.facts.sample_rate_hz)]

@@ -183,21 +183,20 @@ class Retuner:
             if not low - self.goal.reach_hz <= frequency <= high + self.goal.reach_hz:
                 continue
             in_use = schedule.at(frequency)
+            situation = self._situation(plant, damping_std_ns_m, frequency, excitation_amplitude)
             question = _question(plant, damping_std_ns_m, frequency, excitation_amplitude, in_use)
             known = self._solved.get(row)
             try:
                 if known is not None and known.answers(question):
                     point = known.point
                 else:
-                    point = self.point(plant, damping_std_ns_m, frequency, excitation_amplitude, in_use)
+                    point = self._point(situation, in_use)
                     self._solved[row] = _Solved(question, point)
             except NoGainsError as error:
                 reason = f"{frequency:g} Hz: {error}"
                 refusals.append((row, Refusal(frequency, error.binding, reason, error.least_budget_w)))
                 continue
-            points.append(
-                (row, self._or_in_use(plant, damping_std_ns_m, excitation_amplitude, in_use, point))
-            )
+            points.append((row, self._or_in_use(situation, in_use, point)))
         reason = "; ".join(r.reason for _, r in refusals)
         if not points and not refusals:
             reason = f"no point of the table lies within {self.goal.reach_hz:g} Hz of {excitation_hz:.2f} Hz"
@@ -249,7 +248,9 @@ class Retuner:
         NoGainsError
             If nothing may be proposed; it names what binds, and the least budget that would do.
         """
-        situation = self._situation(plant, damping_std_ns_m, frequency_hz, amplitude)
+        return self._point(self._situation(plant, damping_std_ns_m, frequency_hz, amplitude), in_use)
+
+    def _point(self, situation: Situation, in_use: Gains) -> OperatingPoint:
         try:
             best = physical_limit(situation.paths, self._limits)
         except RunError as error:
@@ -316,20 +317,14 @@ class Retuner:
             least_power_w=least,
         )
 
-    def _or_in_use(
-        self, plant: Plant, std: float, amplitude: float, in_use: Gains, point: OperatingPoint
-    ) -> OperatingPoint:
+    def _or_in_use(self, situation: Situation, in_use: Gains, point: OperatingPoint) -> OperatingPoint:
         """Return the point or, if they are sound and hardly worse, the gains in use with what is predicted of them."""
         if in_use == point.gains:
             return replace(point, kept=True)
-        situation = self._situation(plant, std, point.frequency_hz, amplitude)
         verdict = verify(situation, in_use, self._demands)
         if verdict.trouble:
             return point
-        now, new = (
-            verdict.predictions[0],
-            predict(situation.models[0], point.gains, point.frequency_hz, amplitude),
-        )
+        now, new = verdict.predictions[0], situation.predictions(point.gains)[0]
         if self.goal.displacement_m is None:
             gained = now.displacement_m - new.displacement_m
             enough = BETTER_SHARE * now.displacement_m, BETTER_OF_PASSIVE * abs(situation.paths.motion[1])

@@ -13,7 +13,7 @@ the step does what the model promised.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,9 @@ from twin.plant.linear import Array, ComplexArray
 
 ITERATIONS = 20
 FEASIBLE = 1e-6
-SETTLED = 1e-5
+SETTLED = 2e-4
 TINY = 1e-9
+ACCEPTED = 0.1
 NOTHING = 1e-8
 POLES = 3
 HEAVIEST = 1e3
@@ -185,19 +186,48 @@ class GainSearch:
             promised = -(here.gradient @ s + 0.5 * s @ hessian @ s) + penalty * (here.broken - left)
             if here.broken < FEASIBLE and promised < SETTLED * here.objective + NOTHING:
                 break
-            binding = here.binding(step)
-            there = self._look(y + s, binding)
-            gained = here.objective - there.objective + penalty * (here.broken - there.broken)
-            if gained >= 0.1 * promised:
+            binding, wanted = here.binding(step), ACCEPTED * float(promised)
+            there = self._try(y, s, here, binding, penalty, wanted)
+            gained = self._gained(here, there, penalty)
+            if gained < wanted:
+                # What binds bends, or its valley lies elsewhere: the same step once more, by the slopes found there.
+                again = self._step_by(hessian, here, there, s)
+                if again is not None:
+                    elsewhere = self._try(y, again.step, here, there.binding(again), penalty, wanted)
+                    if self._gained(here, elsewhere, penalty) > gained:
+                        s, there = again.step, elsewhere
+                        gained = self._gained(here, there, penalty)
+            if gained >= wanted:
                 y, here = y + s, there
                 damping = max(0.2 * damping, 1e-7)
             elif float(np.max(np.abs(s))) < TINY:
                 break
             else:
-                damping = 5.0 * damping + 1e-5
+                # From a damping that is felt on, each one shortens the step.
+                damping = max(5.0 * damping, 0.5 * float(s @ hessian @ s) / float(s @ s))
                 # The curvature of what binds belongs to the model even where the step is not taken.
                 here = self._look(y, binding, here.decay)
         return self._found(y, here, taken)
+
+    def _try(
+        self, y: Array, s: Array, here: "_Look", binding: "_Binding", penalty: float, wanted: float
+    ) -> "_Look":
+        """Look at the end of a step; its poles, which cost most, only if nothing else speaks against it."""
+        values, slopes = here.decay
+        there = self._look(y + s, binding, (values + slopes @ s, slopes))
+        if self._gained(here, there, penalty) < wanted:
+            return there
+        return there.with_decay(self._decay(y + s))
+
+    @staticmethod
+    def _gained(here: "_Look", there: "_Look", penalty: float) -> float:
+        """How much less objective and breach there is at another point."""
+        return here.objective - there.objective + penalty * (here.broken - there.broken)
+
+    @staticmethod
+    def _step_by(hessian: Array, here: "_Look", there: "_Look", s: Array) -> Step | None:
+        """The step that keeps what is seen at the end of a step ``s`` (second-order correction)."""
+        return solve_step(hessian, here.gradient, there.slopes, there.slopes @ s - there.values)
 
     def _found(self, y: Array, here: "_Look", iterations: int) -> Found:
         step = self._step(_convex(here.hessian, 1e-7), here)
@@ -225,7 +255,8 @@ class GainSearch:
         """Values, slopes and the Lagrangian's curvature at a point, for given multipliers of some constraints."""
         n, conditions, limits = len(self._margin), len(self._weight), len(self._of)
         gradient, hessian = np.empty(3), np.empty((3, 3))
-        reference, first, second = np.empty((3, conditions), dtype=np.complex128)
+        phasors: ComplexArray = np.empty((3, conditions), dtype=np.complex128)
+        reference, first, second = phasors[0], phasors[1], phasors[2]
         objective = look_at_motion(
             y, self._law, self._acceleration, self._target, self._weight, RIDGE, gradient, hessian,
             reference, first, second,
@@ -255,7 +286,9 @@ class GainSearch:
             begin, end = end, end + len(value)
             values[begin:end], slopes[begin:end] = value, slope
             kinds[begin:end], places[begin:end] = kind, np.arange(len(value))
-        return _Look(objective, gradient, hessian, values[:end], slopes[:end], kinds[:end], places[:end], decay)
+        return _Look(
+            objective, gradient, hessian, values[:end], slopes[:end], kinds[:end], places[:end], decay
+        )
 
     def _decay(self, y: Array) -> tuple[Array, Array]:
         """How far the slowest poles are from decaying fast enough, as a share of it."""
@@ -312,6 +345,12 @@ class _Look:
     def broken(self) -> float:
         """By how much."""
         return max(0.0, float(np.max(self.values)))
+
+    def with_decay(self, decay: tuple[Array, Array]) -> "_Look":
+        """The same point with other poles."""
+        rows, values, slopes = self.kinds == DECAY, self.values.copy(), self.slopes.copy()
+        values[rows], slopes[rows] = decay
+        return replace(self, values=values, slopes=slopes, decay=decay)
 
     def binding(self, step: Step) -> _Binding:
         """What a step leans on."""

@@ -7,8 +7,10 @@ of these keep the margin and some do not, and a search that begins beside the wr
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuning.search import Condition
+from twin.plant.compiled import kernel
 from twin.plant.linear import Array, ComplexArray
 
 ALPHAS = np.linspace(-0.6, 1.8, 33)
@@ -53,15 +55,48 @@ def starts(
         answer = wish / (per_ampere * wish + alone)
         rest = answer - law[0] * ALPHAS
         candidates = np.column_stack([ALPHAS, np.linalg.solve(matrix, np.stack([rest.real, rest.imag])).T])
-        around = np.zeros(len(candidates), dtype=np.bool_)
+        around, nearest = np.zeros(len(candidates), dtype=np.bool_), np.empty(len(candidates))
         for terms in reversed(curves):  # the loop as it is comes last and gives the margin
-            one_plus = 1.0 + candidates @ (terms * scale).T
-            turns = np.angle(one_plus[:, 1:] / one_plus[:, :-1]).sum(axis=1) / (2.0 * np.pi)
-            around |= np.abs(turns) > 0.5
-        lacking = np.maximum(0.0, margin - np.abs(one_plus).min(axis=1)) / max(margin, 1e-6)
+            go_around(np.ascontiguousarray(terms * scale), candidates, around, nearest)
+        lacking = np.maximum(0.0, margin - nearest) / max(margin, 1e-6)
         outside = np.maximum(limits[:, 0] - candidates, candidates - limits[:, 1]).max(axis=1)
         cost = (1.0 - share) + 2.0 * lacking + 10.0 * np.maximum(0.0, outside) + np.where(around, 10.0, 0.0)
         best = int(np.argmin(cost + 1e-3 * np.abs(ALPHAS)))
         found.append((float(cost[best]), candidates[best]))
     found.sort(key=lambda pair: pair[0])
     return [*(np.clip(y, limits[:, 0], limits[:, 1]) * scale for cost, y in found if cost < 5.0), np.zeros(3)]
+
+
+@kernel
+def go_around(terms: ComplexArray, candidates: Array, around: NDArray[np.bool_], nearest: Array) -> None:
+    """Which loops go around -1, and how near they come to it.
+
+    Parameters
+    ----------
+    terms
+        (n, 3) loop gain per unit of each gain over rising frequency.
+    candidates
+        (c, 3) gains.
+    around
+        (c,) set True where 1 + L turns by more than half around zero.
+    nearest
+        (c,) receives the least |1 + L|.
+    """
+    for c in range(len(candidates)):
+        turns, least, first, before = 0.0, np.inf, 0.0 + 0.0j, 0.0 + 0.0j
+        for k in range(len(terms)):
+            q = 1.0 + 0.0j
+            for v in range(3):
+                q += terms[k, v] * candidates[c, v]
+            least = min(least, q.real * q.real + q.imag * q.imag)
+            if k == 0:
+                first = q
+            elif (before.imag < 0.0) != (q.imag < 0.0):
+                # The branch cut of the angle is the negative real axis: where a chord crosses it counts.
+                share = before.imag / (before.imag - q.imag)
+                if before.real + share * (q.real - before.real) < 0.0:
+                    turns += 1.0 if q.imag < 0.0 else -1.0
+            before = q
+        turns += (np.arctan2(before.imag, before.real) - np.arctan2(first.imag, first.real)) / (2.0 * np.pi)
+        around[c] = around[c] or abs(turns) > 0.5
+        nearest[c] = np.sqrt(least)

@@ -11,18 +11,17 @@ from functools import cached_property
 import numpy as np
 
 from tuning.limit import CoilLimits
-from tuning.loop import LoopFacts, Margins, RigModel, margins, mode_grid
-from tuning.steady import Prediction, SteadyPaths, paths_from, reference_under
-from twin.control.chain import chain_response
+from tuning.loop import LoopFacts, Margins, RigModel, loop_margins, mode_grid
+from tuning.steady import Prediction, SteadyPaths, paths_from
 from twin.control.schedule import Gains
 from twin.plant.config import Plant
 from twin.plant.linear import Array, ComplexArray
 
 ROUNDING = 1e-9
 CHECK_POINTS = 150
-DESIGN_POINTS = 36
+DESIGN_POINTS = 40
 DELAYS = (0.5, 1.0)
-VALLEYS, BETWEEN = 3, 41
+VALLEYS, BETWEEN = 3, np.linspace(0.0, 1.0, 41)
 
 
 class Situation:
@@ -55,6 +54,7 @@ class Situation:
         dampings = [damping] if off == 0.0 else [damping, max(0.0, damping - off), damping + off]
         self.facts, self.frequency_hz, self.amplitude = facts, frequency_hz, amplitude
         self.damping_std_ns_m = damping_std_ns_m
+        self._chains: dict[str, tuple[tuple[float, float], ComplexArray]] = {}
         self.models = [RigModel(plant, facts, frequency_hz, c) for c in dampings]
         nominal = self.models[0]
         beside = [frequency_hz - drift_hz, frequency_hz + drift_hz] if drift_hz > 0.0 else []
@@ -74,12 +74,8 @@ class Situation:
 
     @cached_property
     def design_grid(self) -> Array:
-        """Frequencies the search looks at [Hz]."""
+        """Frequencies the search looks at first [Hz]."""
         return mode_grid(self.models[0], DESIGN_POINTS)
-
-    @cached_property
-    def _design_accelerations(self) -> list[ComplexArray]:
-        return [m.acceleration(self.design_grid) for m in self.models]
 
     @cached_property
     def _check_grid(self) -> Array:
@@ -89,46 +85,58 @@ class Situation:
     def _check_accelerations(self) -> list[ComplexArray]:
         return [m.acceleration(self._check_grid) for m in self.models]
 
-    def design_terms(self, cutoffs_hz: tuple[float, float]) -> list[ComplexArray]:
-        """Loop gain per unit of each gain on the design grid, one (n, 3) per model."""
-        chain = self._chain(self.design_grid, cutoffs_hz)
-        return [-a[:, None] * chain for a in self._design_accelerations]
+    def loop_terms(self, grid: Array, cutoffs_hz: tuple[float, float]) -> list[ComplexArray]:
+        """Loop gain per unit of each gain on a grid [Hz], one (n, 3) per model."""
+        chain = self._chain(grid, cutoffs_hz)
+        return [-m.acceleration(grid)[:, None] * chain for m in self.models]
+
+    def laws(self, cutoffs_hz: tuple[float, float]) -> ComplexArray:
+        """Reference per measured acceleration and unit of each gain, (cases, 3)."""
+        return self._kept("laws", cutoffs_hz, np.array([paths.frequency_hz for _, paths in self.cases]))
 
     def _chain(self, grid: Array, cutoffs_hz: tuple[float, float]) -> ComplexArray:
-        model = self.models[0]
-        delay = np.exp(-2j * np.pi * grid * self.facts.delay_samples / self.facts.sample_rate_hz)
-        chain = chain_response(grid, *cutoffs_hz, self.facts.sample_rate_hz)
-        return np.asarray(chain * (delay / model.coil.force_constant_n_a)[:, None])
+        return self.models[0].paths(grid, *cutoffs_hz)
+
+    def _kept(self, name: str, cutoffs_hz: tuple[float, float], grid: Array) -> ComplexArray:
+        """The chain on a grid that is asked for again with the same cutoffs."""
+        known = self._chains.get(name)
+        if known is None or known[0] != cutoffs_hz:
+            known = self._chains[name] = cutoffs_hz, self._chain(grid, cutoffs_hz)
+        return known[1]
 
     def predictions(self, gains: Gains) -> list[Prediction]:
         """Steady state of every case, the nominal one at the excitation first."""
-        return [paths.at(reference_under(model, gains, paths)) for model, paths in self.cases]
+        responses = self.laws((gains.low_pass_hz, gains.high_pass_hz)) @ _numbers(gains)
+        out = []
+        for response, (_, paths) in zip(responses.tolist(), self.cases, strict=True):
+            per_ampere, alone = paths.acceleration
+            out.append(paths.at(response * alone / (1.0 - response * per_ampere)))
+        return out
 
     def margins(self, gains: Gains) -> Margins:
-        """The least margins of all models."""
-        chain = self._chain(self._check_grid, (gains.low_pass_hz, gains.high_pass_hz))
-        found = [margins(-a[:, None] * chain, self._check_grid, gains) for a in self._check_accelerations]
-        delay = min((m.delay_s for m in found if m.delay_s is not None), default=None)
-        deepest = min(
-            self._bottom(model, a, chain, gains)
-            for model, a in zip(self.models, self._check_accelerations, strict=True)
-        )
-        return Margins(min(deepest, *(m.modulus for m in found)), delay)
-
-    def _bottom(
-        self, model: RigModel, acceleration: ComplexArray, chain: ComplexArray, gains: Gains
-    ) -> float:
-        """Least |1 + L| in the deepest valleys, looked at again between the grid's points."""
-        law = np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
-        distance = np.abs(1.0 - acceleration * (chain @ law))
-        inner = np.nonzero((distance[1:-1] <= distance[:-2]) & (distance[1:-1] <= distance[2:]))[0] + 1
-        deepest = inner[np.argsort(distance[inner], kind="stable")[:VALLEYS]]
-        if not len(deepest):
-            return float(distance.min())
-        grid = self._check_grid
-        fine = np.concatenate([np.linspace(grid[k - 1], grid[k + 1], BETWEEN) for k in deepest])
-        path = self._chain(fine, (gains.low_pass_hz, gains.high_pass_hz)) @ law
-        return float(np.min(np.abs(1.0 - model.acceleration(fine) * path)))
+        """The least margins of all models; the deepest valleys are looked at again between the grid's points."""
+        cutoffs = gains.low_pass_hz, gains.high_pass_hz
+        grid, law = self._check_grid, _numbers(gains)
+        chain = self._kept("check", cutoffs, grid) @ law
+        modulus, delay = math.inf, math.inf
+        fine: list[Array] = []
+        for acceleration in self._check_accelerations:
+            L = -acceleration * chain
+            found = loop_margins(L, grid)
+            modulus = min(modulus, found.modulus)
+            delay = min(delay, math.inf if found.delay_s is None else found.delay_s)
+            distance = np.abs(1.0 + L)
+            inner = np.nonzero((distance[1:-1] <= distance[:-2]) & (distance[1:-1] <= distance[2:]))[0] + 1
+            deepest = inner[np.argsort(distance[inner], kind="stable")[:VALLEYS]]
+            between = grid[deepest - 1] + BETWEEN[:, None] * (grid[deepest + 1] - grid[deepest - 1])
+            fine.append(between)
+        path = self._chain(np.concatenate([f.ravel() for f in fine]), cutoffs) @ law
+        end = 0
+        for model, between in zip(self.models, fine, strict=True):
+            begin, end = end, end + between.size
+            distance = np.abs(1.0 - model.acceleration(between.ravel()) * path[begin:end])
+            modulus = min(modulus, float(distance.min(initial=math.inf)))
+        return Margins(modulus, delay if delay < math.inf else None)
 
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of all models [1/s]; below 0 is stable."""
@@ -165,6 +173,10 @@ class Verdict:
     margins: Margins
     decay_rate_1_s: float
     predictions: tuple[Prediction, ...]
+
+
+def _numbers(gains: Gains) -> Array:
+    return np.array([gains.alpha_kg, gains.beta_ns_m, gains.gamma_n_m])
 
 
 def verify(situation: Situation, gains: Gains, demands: Demands) -> Verdict:
