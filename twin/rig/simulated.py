@@ -194,7 +194,8 @@ class SimulatedRig:
                 reason = f"cutoff {fastest:g} Hz is not below half of the sample rate"
                 answers.append(Acknowledgement(command_id=command.command_id, accepted=False, reason=reason))
                 continue
-            late = first - command.apply_at_sample
+            # An order for sample 0 is one for the next block, whichever that is.
+            late = first - command.apply_at_sample if command.apply_at_sample else 0
             if command.schedule is not None:
                 self.schedule = command.schedule
             if command.control_enabled is not None:

@@ -328,6 +328,9 @@ def parse_changes(given: dict[str, Any]) -> Changes:
     InputError
         If a key is unknown or a value cannot be used.
     """
+    for key, value in given.items():
+        if key != "budget_kind" and not (value is None or isinstance(value, float | int)):
+            raise InputError(f"{str(key)[:40]}: '{str(value)[:40]}' is no number")
     try:
         return Changes(**{str(k): v for k, v in given.items() if k != "coil" and v is not None})
     except TypeError as error:

@@ -14,10 +14,6 @@ MAX_BODY_BYTES = 16 * 1024
 READING = ("GET", "HEAD")
 
 
-class TooLargeError(Exception):
-    """A body grew past what is taken."""
-
-
 class Guard:
     """ASGI middleware in front of everything.
 
@@ -74,28 +70,20 @@ class Guard:
         if answer is not None:
             await answer(scope, receive, self._with_headers(send))
             return
-        size, begun = 0, False
+        if scope["method"] in READING:
+            await self._app(scope, receive, self._with_headers(send))
+            return
+        body = await _body(receive)
+        if body is None:
+            answer = self._refuse(scope, 413, "the message is too large")
+            await answer(scope, receive, self._with_headers(send))
+            return
+        waiting: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
-        async def measured() -> Message:
-            nonlocal size
-            message = await receive()
-            size += len(message.get("body", b""))
-            if size > MAX_BODY_BYTES:
-                raise TooLargeError
-            return message
+        async def replayed() -> Message:
+            return waiting.pop() if waiting else await receive()
 
-        async def noted(message: Message) -> None:
-            nonlocal begun
-            begun = True
-            await self._with_headers(send)(message)
-
-        try:
-            await self._app(scope, measured, noted)
-        except TooLargeError:
-            if not begun:
-                await self._refuse(scope, 413, "the message is too large")(
-                    scope, receive, self._with_headers(send)
-                )
+        await self._app(scope, replayed, self._with_headers(send))
 
     def _objection(self, scope: Scope) -> Response | None:
         headers, method = Headers(scope=scope), scope["method"]
@@ -152,3 +140,17 @@ class Guard:
             await send(message)
 
         return sending
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """Read the whole body; None if it grows past what is taken, or is broken off."""
+    body = b""
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None
+        body += bytes(message.get("body", b""))
+        if len(body) > MAX_BODY_BYTES:
+            return None
+        if not message.get("more_body", False):
+            return body

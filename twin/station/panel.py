@@ -12,6 +12,9 @@ from twin.station.frame import ROUTINE, Frame
 from twin.station.session import Session
 
 LOG_ROWS = 500
+POWER_BLOCKS = 10
+"""Power is shown as the mean of so many blocks: what sensor noise burns differs from one to the next."""
+
 TIGHT_SHARE = 0.7
 """A loop that needs more of a block's time than this is near its end."""
 
@@ -53,6 +56,8 @@ class Panel:
     state: dict[str, Any] = field(default_factory=dict)
     log: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=LOG_ROWS))
     _seq: int = 0
+    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=POWER_BLOCKS))
+    _loads: deque[float] = field(default_factory=lambda: deque(maxlen=20))
     _sent: dict[str, Any] | None = None
     _audit: AuditPoint | None = None
 
@@ -65,6 +70,8 @@ class Panel:
             self._audit = frame.audited
         goal = session.settings.goal if retuning is None else retuning.goal
         length_s = block.n_samples / block.sample_rate_hz
+        self._loads.append(in_loop_s / length_s)
+        load = sum(self._loads) / len(self._loads)
         learner = None
         if frame.curve is not None and frame.phasors is not None:
             learner = {
@@ -79,7 +86,7 @@ class Panel:
             "config_id": block.config_id or session.plant.fingerprint,
             "model_id": session.identified_plant().fingerprint,
             "wire": {name: getattr(wire, name) for name in WireState.__slots__},
-            "load": finite(in_loop_s / length_s, 3),
+            "load": finite(load, 3),
             "unseen": unseen,
             "health": {
                 "verdict": frame.health.verdict,
@@ -96,19 +103,21 @@ class Panel:
             "can_revert": retuning is not None and retuning.can_revert,
             "sent": self._sent,
             "audit": None if self._audit is None else audit_figures(self._audit),
-            "alarms": self._alarms(frame, in_loop_s / length_s, wire, goal),
+            "alarms": self._alarms(frame, load, wire, goal),
         }
 
     def _performance(self, frame: Frame, goal: TuningGoal) -> dict[str, Any] | None:
         p = frame.performance
         if p is None:
+            self._spent.clear()
             return None
+        self._spent.append(p.powers.of_kind(goal.budget_kind))
         return {
             "displacement_m": finite(p.displacement_m),
             "passive_m": finite(p.passive_m),
             "limit_m": finite(p.limit_m),
             "current_peak_a": finite(p.current_peak_a),
-            "power_w": finite(p.powers.of_kind(goal.budget_kind)),
+            "power_w": finite(sum(self._spent) / len(self._spent)),
             **power_figures(p.powers),
         }
 
@@ -129,8 +138,9 @@ class Panel:
         if load > TIGHT_SHARE:
             found.append(f"The loop needs {100 * load:.0f} % of a block's time")
         p = frame.performance
-        if p is not None and p.powers.of_kind(goal.budget_kind) > 1.1 * goal.budget_w:
-            found.append(f"Power {p.powers.of_kind(goal.budget_kind):.2f} W over the budget {goal.budget_w:g} W")
+        spent = sum(self._spent) / len(self._spent) if self._spent else 0.0
+        if spent > 1.15 * goal.budget_w:
+            found.append(f"Power {spent:.3g} W over the budget of {goal.budget_w:.3g} W")
         limit = self._current_limit()
         if p is not None and p.current_peak_a > 0.98 * limit:
             found.append(f"Coil current {p.current_peak_a:.2f} A at its limit {limit:g} A")

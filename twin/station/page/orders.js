@@ -57,7 +57,7 @@ function show(p) {
   frame.tabIndex = 0;
   const table = document.createElement("table");
   const head = table.createTHead().insertRow();
-  for (const name of ["Hz", "γ [N/mm]", "β [Ns/m]", "µm now → then", "W", "margin"]) head.append(Object.assign(node("th", name, "n"), { scope: "col" }));
+  for (const name of ["Hz", "γ [N/mm]", "β [Ns/m]", "motion [µm]", "W", "margin"]) head.append(Object.assign(node("th", name, "n"), { scope: "col" }));
   const body = table.createTBody();
   for (const r of p.rows) {
     const row = body.insertRow();
@@ -181,8 +181,9 @@ export function follow(s) {
   if (s.audit && (step === "ack" || step === "audit")) {
     at("audit");
     const a = s.audit, list = node("dl", "", "figures");
-    const add = (name, pair, unit, f) => list.append(node("dt", name), node("dd", `${f(pair[0])} → ${f(pair[1])} ${unit}`));
-    add(`motion at ${number(a.frequency_hz, 4)} Hz, predicted → achieved`, a.displacement_m, "µm", micro);
+    const add = (name, pair, unit, f, note = "") => list.append(node("dt", name), node("dd", `${f(pair[0])} → ${f(pair[1])} ${unit}${note}`));
+    const small = Math.max(...a.displacement_m) < a.floor_m;
+    add(`motion at ${number(a.frequency_hz, 4)} Hz, predicted → achieved`, a.displacement_m, "µm", micro, small ? ` (both below ${micro(a.floor_m)} µm, less than can be told)` : "");
     add("mean Joule power, predicted → achieved", a.joule_mean_w, "W", number);
     $("audit").replaceChildren(list);
   }

@@ -19,7 +19,7 @@ export function showStatus(s) {
   const p = s.performance;
   chip("s-motion", p && p.displacement_m !== null ? `${micro(p.displacement_m)} µm at ${number(s.excitation_hz, 4)} Hz` : "–", "",
     p ? `without control ${micro(p.passive_m)} µm, physical limit ${micro(p.limit_m)} µm` : "");
-  const over = p && p.power_w > s.goal.budget_w;
+  const over = p && p.power_w > 1.15 * s.goal.budget_w;
   chip("s-power", p && p.power_w !== null ? `${number(p.power_w)} / ${number(s.goal.budget_w)} W` : "–", p ? (over ? "bad" : "good") : "",
     p ? `mean Joule ${number(p.joule_mean_w)} W, peak Joule ${number(p.joule_peak_w)} W, mean electrical ${number(p.electrical_mean_w)} W` : "");
   const h = s.health, fine = h.verdict === "consistent";
