@@ -5,43 +5,43 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from twin.station.replay import ReplayOptions, open_any
+from twin.station.opened import ReplayOptions, open_any
+from twin.station.player import Player
 from twin.station.summary import RunLog
 
 FOLDER = Path(__file__).resolve().parent
 RECORDING, CONFIG, EXPECTED = "recording.rrd", "config.toml", "expected.json"
 
 
-def replay_results(path: Path) -> dict[str, Any]:
-    """Replay one recording through a session.
+RECOMPUTED = ReplayOptions(recompute=True)
+
+
+def replay_results(path: Path, options: ReplayOptions = RECOMPUTED) -> dict[str, Any]:
+    """Replay one recording through a session, every answer of the tuner worked out again unless told otherwise.
 
     Returns
     -------
     dict
         ``figures`` of the run; ``damping``, the learned curve; ``estimate``, the observer's last state;
-        ``decisions`` and ``commands`` in order; ``commands_repeated``, whether they are those of the run itself;
+        ``events``, ``decisions`` and ``commands`` in order; ``commands_repeated``, whether they are the run's own;
         ``digest`` of every estimate's and every twin's bits, the same on the same machine only.
     """
-    opened = open_any(path, ReplayOptions())
-    session = opened.session()
-    session.warm_up()
+    opened = open_any(path, options)
+    player = Player(opened, checkpoint_s=None)
+    player.session.warm_up()
     log, digest = RunLog(), hashlib.sha256()
-    answers = list(opened.acknowledgements)
     decisions, commands = [], []
-    for block in opened.blocks():
-        due = tuple(a for sample, a in answers if sample < block.end_sample)
-        answers = answers[len(due) :]
-        frame = session.advance(block, due)
+    events: list[str] = []
+    for frame in player.play():
         log.add(frame)
+        events += [event.text for event in frame.events]
         digest.update(frame.twin.tobytes())
         digest.update(frame.estimate.mean.tobytes())
         digest.update(frame.estimate.covariance.tobytes())
         if frame.curve is not None:
             digest.update(frame.curve.damping_ns_m.tobytes())
-        if frame.decision is not None:
-            decisions.append(asdict(frame.decision))
-        if frame.command is not None:
-            commands.append(frame.command)
+        decisions += [asdict(decision) for decision in frame.decisions]
+        commands += frame.commands
     made = {command.command_id: command for command in commands}
     curve = log.curve
     return {
@@ -56,6 +56,7 @@ def replay_results(path: Path) -> dict[str, Any]:
             "status": curve.status,
         },
         "estimate": dict(zip(frame.estimate.states, frame.estimate.mean[-1].tolist(), strict=True)),
+        "events": events,
         "decisions": decisions,
         "commands": [command.model_dump(mode="json") for command in commands],
         "commands_repeated": None if opened.commands is None else made == opened.commands,

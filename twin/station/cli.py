@@ -253,7 +253,7 @@ def replay(
         bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
     ] = False,
     from_s: Annotated[
-        float, typer.Option("--from", min=0.0, metavar="S", help="Show from here on; what lies before is played unseen.")
+        float, typer.Option("--from", min=0.0, metavar="S", help="Show from here on; what was before is played unseen.")
     ] = 0.0,
     to_s: Annotated[float | None, typer.Option("--to", min=0.0, metavar="S", help="End here.")] = None,
     speed: Annotated[

@@ -66,6 +66,8 @@ class Outputs:
         Serve Rerun's web viewer on this machine.
     storage
         When another file is begun, and how much all may take.
+    looked_at
+        Whether the recording holds the series that people look at, besides what a replay needs.
     """
 
     def __init__(
@@ -79,6 +81,7 @@ class Outputs:
         window: bool = False,
         web: bool = False,
         storage: Storage | None = None,
+        looked_at: bool = True,
     ) -> None:
         self._model: float | None = None
         self._session = session
@@ -103,7 +106,7 @@ class Outputs:
                 storage=storage,
                 software=software(),
             )
-            self._file_view = self._new_file_view(self.recorder)
+            self._file_view = self._new_file_view(self.recorder) if looked_at else None
         if web or window:
             stream = rr.RecordingStream(APPLICATION)
             if web:
