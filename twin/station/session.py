@@ -8,8 +8,8 @@ on nothing else, so that a replay repeats it.
 """
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -489,15 +489,32 @@ def settings_from(configuration: dict[str, Any]) -> SessionSettings:
         return SessionSettings(
             loop=None if loop is None else LoopFacts(**loop),
             schedule=None if schedule is None else GainSchedule.model_validate(schedule, strict=False),
-            goal=TuningGoal(**c.pop("goal")),
-            learner=LearnerSettings(**c.pop("learner")),
-            retuning=RetuningSettings(**c.pop("retuning")),
+            goal=_settings(TuningGoal, "goal", c.pop("goal")),
+            learner=_settings(LearnerSettings, "learner", c.pop("learner")),
+            retuning=_settings(RetuningSettings, "retuning", c.pop("retuning")),
             **c,
         )
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"the recording's configuration cannot be read ({error}); was it made by another version?"
         ) from error
+
+
+_S = TypeVar("_S")
+
+
+def _settings(kind: type[_S], name: str, values: dict[str, Any]) -> _S:
+    """Build settings; a key that is no longer one would change results if it were passed over."""
+    known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    unknown = [f"{name}.{key}" for key in values if key not in known]
+    if unknown:
+        raise InputError(
+            f"the recording was made by a version with the setting {', '.join(unknown)}, which this one does not have: "
+            "replay it with that version, or export its samples (atmd recordings export) and replay those with --plant"
+        )
+    return kind(**values)
 
 
 def _learner(plant: Plant, settings: SessionSettings) -> DampingLearner:
