@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import chain, filters, observer, plant, replay, retune
+from benchmarks import campaign, chain, filters, observer, plant, replay, retune
 from benchmarks.report import Report
 
 CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
@@ -12,6 +12,7 @@ CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
     "filters": (filters.run_filters, filters.Setting(), filters.SMALL),
     "chain": (chain.run_chain, chain.Setting(), chain.SMALL),
     "replay": (replay.run_replays, replay.Setting(), replay.SMALL),
+    "campaign": (campaign.run_campaign_case, campaign.Setting(), campaign.SMALL),
     "retune": (retune.run_retune, retune.Setting(), retune.SMALL),
 }
 

@@ -244,7 +244,7 @@ def test_draws_follow_their_distributions() -> None:
         (('kind = "thesis"', 'kind = "retuned"'), r"budgets_w \[W\]: missing"),
         (('at_hz = "45:55:1"', 'at_hz = "45-55"'), "schedule.at_hz 45-55"),
         (("sample_rate_hz = 10000.0", "sample_rate_hz = 2000.0"), "half of sample_rate_hz"),
-        (('seed = 3', 'seed = 3\nplants = ["engine"]'), "voice coil|voice_coil|has none of that name"),
+        (("seed = 3", 'seed = 3\nplants = ["rig_no_vcm"]'), "no voice coil between two bodies"),
     ],
 )
 def test_a_specification_that_cannot_be_used_says_why(change: tuple[str, str], wanted: str) -> None:

@@ -46,7 +46,7 @@ def run_on_cluster(address: str, campaign: Campaign, jobs: Sequence[Job]) -> Ite
             client.submit(run_job, campaign, job, pure=False, retries=LIVES, key=f"{campaign.fingerprint}-{job.number}"): job
             for job in jobs
         }
-        for future in as_completed(list(futures)):
+        for future in as_completed(list(futures), loop=client.loop):
             if future.status != "finished":
                 raise RunError(f"--scheduler {address}: job {futures[future].number} failed ({future.exception()!r})")
             rows = future.result()

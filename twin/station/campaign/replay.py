@@ -11,7 +11,7 @@ import numpy as np
 from tuning.loop import RigModel
 from tuning.retune import TuningGoal
 from twin.plant.blocks import make_block
-from twin.plant.config import DampingTable
+from twin.plant.config import DampingTable, Plant
 from twin.plant.discrete import DiscreteModel
 from twin.plant.errors import InputError
 from twin.plant.linear import LinearModel
@@ -79,6 +79,15 @@ def case_programme(campaign: Campaign, drawn: Drawn) -> Programme:
     )
 
 
+def _model_of(drawn: Drawn, programme: Programme) -> Plant:
+    """What the twin starts from: the case's plant, with one damping, as it learns the curve itself."""
+    plant, absorber = drawn.case.plant, drawn.case.plant.absorber
+    if absorber is None or not isinstance(absorber.damping_ns_m, DampingTable):
+        return plant
+    at = programme.sweep.frequency_at(0, programme.sample_rate_hz)
+    return plant.with_damping(absorber.name, absorber.damping_at(at))
+
+
 def replay_case(
     campaign: Campaign,
     number: int,
@@ -121,7 +130,7 @@ def replay_case(
     settings = SessionSettings(
         loop=drawn.case.facts, schedule=drawn.case.schedule, goal=goal, retuning=RetuningSettings(every_blocks=NEVER)
     )
-    session = Session(programme.true_plant, rig.channels, spec.sample_rate_hz, settings)
+    session = Session(_model_of(drawn, programme), rig.channels, spec.sample_rate_hz, settings)
     log = RunLog()
     with Outputs(
         session,
