@@ -7,7 +7,7 @@ import numpy as np
 
 from tuning.gains import GainProgram
 from tuning.limit import Disc, discs, electrical_square
-from tuning.search import Condition, Found, GainSearch, Stability
+from tuning.search import ITERATIONS, Condition, Found, GainSearch, Stability
 from tuning.start import starts
 from tuning.steady import Pair, SteadyPaths
 from tuning.types import ActiveLimit, BudgetKind
@@ -26,7 +26,9 @@ LATE_MARGIN = 0.05
 NEXT_TO_LIMIT = 1e-3
 """Nothing better is sought this near to the physical limit, as a share of it and of the passive motion."""
 
-TIGHTENINGS = 5
+TIGHTENINGS, AGAIN = 5, 10
+"""How often a search is repeated with the margin tightened, and its iterations then: it begins next to its end."""
+
 FAILED = 1e-4
 
 
@@ -103,26 +105,29 @@ class Designer:
         left = abs(situation.paths.motion[0] * wish_a + situation.paths.motion[1]) / unit
         enough = 0.0 if kind is not None else left**2 * (1.0 + 2.0 * NEXT_TO_LIMIT) + NEXT_TO_LIMIT**2
         grid = situation.design_grid
-        terms = situation.loop_terms(grid, cutoffs_hz)
         margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
         first: list[Array] | None = None
-        for _ in range(TIGHTENINGS):
+        for tightening in range(TIGHTENINGS):
+            terms = situation.loop_terms(grid, cutoffs_hz)
             stability = self._stability(situation, grid, cutoffs_hz, demands, terms, margin, late)
             search = GainSearch(self._scale, self._bounds, conditions, stability, unit, enough)
             if first is None:
                 curves = [terms[0], *self._late(grid, terms[0], demands)]
                 first = self._starts(conditions[0], wish_a, curves, margin)
-            found = self._best(search, first)
+            found = self._best(search, first, ITERATIONS if tightening == 0 else AGAIN)
             alpha, beta, gamma = (float(x) for x in found.numbers)
             gains = Gains(alpha, beta, gamma, *cutoffs_hz)
             if found.violation > FAILED:
                 break
-            seen = situation.margins(gains)
+            seen, valleys = situation.margins_and_valleys(gains, margin)
             short = demands.modulus_margin * (1.0 + INSIDE) - seen.modulus
             hasty = seen.delay_s is not None and seen.delay_s < demands.delay_margin_s
             if short <= 0.0 and not hasty:
                 break
-            margin += 1.5 * max(short, 0.0) + (1e-5 if short > 0.0 else 0.0)
+            if short > 0.0:
+                # The grid is too coarse for that valley: denser there, and some more margin.
+                grid = _halved(grid, valleys)
+                margin += (0.5 if tightening == 0 else 1.5) * short + 1e-5
             late += LATE_MARGIN if hasty else 0.0
             first = [found.numbers, *first] if hasty else [found.numbers]
         return Design(
@@ -194,10 +199,12 @@ class Designer:
         return found
 
     @staticmethod
-    def _best(search: GainSearch, first: list[Array]) -> Found:
+    def _best(search: GainSearch, first: list[Array], iterations: int) -> Found:
         best: Found | None = None
         for start in first:
-            found = search.run(start)
+            if start is not first[-1] and not search.is_stable(start):
+                continue  # From an unstable loop a search rarely comes back.
+            found = search.run(start, iterations)
             if best is None or (found.violation > FAILED, found.objective) < (
                 best.violation > FAILED,
                 best.objective,
@@ -208,6 +215,13 @@ class Designer:
         if best is None:
             raise ValueError("no start was given")
         return best
+
+
+def _halved(grid: Array, near: Array) -> Array:
+    """A grid with points between those on either side of some frequencies."""
+    at = np.searchsorted(grid, near)[:, None] + np.arange(-2, 2)
+    at = np.unique(np.clip(at, 0, len(grid) - 2))
+    return np.union1d(grid, 0.5 * (grid[at] + grid[at + 1]))
 
 
 def _target(paths: SteadyPaths, kind: BudgetKind | None) -> Pair:

@@ -38,7 +38,7 @@ from twin.plant.linear import Array, ComplexArray
 
 ITERATIONS = 20
 FEASIBLE = 1e-6
-SETTLED = 2e-4
+SETTLED = 1e-4
 TINY = 1e-9
 ACCEPTED = 0.1
 NOTHING = 1e-8
@@ -155,8 +155,8 @@ class GainSearch:
         self._margin = stability.margin
         self._inner = ~(stability.first | np.roll(stability.first, -1))
         self._stability = stability
-        self._law = np.array([c.law for c in conditions]) * scale
-        self._acceleration = np.array([c.acceleration for c in conditions], dtype=np.complex128)
+        self._law: ComplexArray = np.array([c.law for c in conditions], dtype=np.complex128) * scale
+        self._acceleration: ComplexArray = np.array([c.acceleration for c in conditions], dtype=np.complex128)
         self._target = np.array([c.target for c in conditions], dtype=np.complex128) / unit
         self._weight = np.array([c.weight for c in conditions])
         self._of = np.array([k for k, c in enumerate(conditions) for _ in c.bounds], dtype=np.int64)
@@ -166,13 +166,17 @@ class GainSearch:
         self._offset = np.array([d.offset / d.bound for d in limits], dtype=np.complex128)
         self._enough = enough
 
-    def run(self, start: Array) -> Found:
-        """Search from a start (3,) in SI units."""
+    def is_stable(self, start: Array) -> bool:
+        """Whether the loop decays with gains (3,) in SI units, however slowly."""
+        return bool(np.all(self._decay(start / self._scale)[0] < 1.0))
+
+    def run(self, start: Array, iterations: int = ITERATIONS) -> Found:
+        """Search from a start (3,) in SI units, for so many iterations at most."""
         y = np.clip(start / self._scale, self._bounds[:, 0], self._bounds[:, 1])
         damping, penalty = 1e-3, 1e-2
         here = self._look(y, FREE)
         taken = 0
-        while taken < ITERATIONS:
+        while taken < iterations:
             taken += 1
             if here.broken < FEASIBLE and here.objective - RIDGE * float(y @ y) < self._enough:
                 break
@@ -255,8 +259,7 @@ class GainSearch:
         """Values, slopes and the Lagrangian's curvature at a point, for given multipliers of some constraints."""
         n, conditions, limits = len(self._margin), len(self._weight), len(self._of)
         gradient, hessian = np.empty(3), np.empty((3, 3))
-        phasors: ComplexArray = np.empty((3, conditions), dtype=np.complex128)
-        reference, first, second = phasors[0], phasors[1], phasors[2]
+        reference, first, second = (np.empty(conditions, dtype=np.complex128) for _ in range(3))
         objective = look_at_motion(
             y, self._law, self._acceleration, self._target, self._weight, RIDGE, gradient, hessian,
             reference, first, second,
@@ -286,8 +289,17 @@ class GainSearch:
             begin, end = end, end + len(value)
             values[begin:end], slopes[begin:end] = value, slope
             kinds[begin:end], places[begin:end] = kind, np.arange(len(value))
+        values = values[:end]
         return _Look(
-            objective, gradient, hessian, values[:end], slopes[:end], kinds[:end], places[:end], decay
+            objective,
+            gradient,
+            hessian,
+            values,
+            slopes[:end],
+            kinds[:end],
+            places[:end],
+            decay,
+            *_worst(values),
         )
 
     def _decay(self, y: Array) -> tuple[Array, Array]:
@@ -325,7 +337,15 @@ FREE = _Binding(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zer
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What the search sees at one point: constraints are kept where ``values <= 0``."""
+    """What the search sees at one point: constraints are kept where ``values <= 0``.
+
+    Attributes
+    ----------
+    decay
+        Values and slopes of the decay's rows.
+    worst, broken
+        Row of the constraint that is broken most, and by how much.
+    """
 
     objective: float
     gradient: Array
@@ -335,26 +355,24 @@ class _Look:
     kinds: NDArray[np.int64]
     places: NDArray[np.int64]
     decay: tuple[Array, Array]
-
-    @property
-    def worst(self) -> int:
-        """Row of the constraint that is broken most."""
-        return int(np.argmax(self.values))
-
-    @property
-    def broken(self) -> float:
-        """By how much."""
-        return max(0.0, float(np.max(self.values)))
+    worst: int
+    broken: float
 
     def with_decay(self, decay: tuple[Array, Array]) -> "_Look":
         """The same point with other poles."""
         rows, values, slopes = self.kinds == DECAY, self.values.copy(), self.slopes.copy()
         values[rows], slopes[rows] = decay
-        return replace(self, values=values, slopes=slopes, decay=decay)
+        worst, broken = _worst(values)
+        return replace(self, values=values, slopes=slopes, decay=decay, worst=worst, broken=broken)
 
     def binding(self, step: Step) -> _Binding:
         """What a step leans on."""
         return _Binding(self.kinds[step.rows], self.places[step.rows], np.minimum(step.multipliers, HEAVIEST))
+
+
+def _worst(values: Array) -> tuple[int, float]:
+    row = int(values.argmax())
+    return row, max(0.0, float(values[row]))
 
 
 def _convex(hessian: Array, damping: float) -> Array:

@@ -114,7 +114,14 @@ class Situation:
         return out
 
     def margins(self, gains: Gains) -> Margins:
-        """The least margins of all models; the deepest valleys are looked at again between the grid's points."""
+        """The least margins of all models."""
+        return self.margins_and_valleys(gains, 0.0)[0]
+
+    def margins_and_valleys(self, gains: Gains, below: float) -> tuple[Margins, Array]:
+        """The least margins of all models, and where |1 + L| has its deepest bottoms below some distance [Hz].
+
+        The deepest valleys are looked at again between the grid's points.
+        """
         cutoffs = gains.low_pass_hz, gains.high_pass_hz
         grid, law = self._check_grid, _numbers(gains)
         chain = self._kept("check", cutoffs, grid) @ law
@@ -131,12 +138,15 @@ class Situation:
             between = grid[deepest - 1] + BETWEEN[:, None] * (grid[deepest + 1] - grid[deepest - 1])
             fine.append(between)
         path = self._chain(np.concatenate([f.ravel() for f in fine]), cutoffs) @ law
-        end = 0
+        end, bottoms = 0, [np.zeros(0)]
         for model, between in zip(self.models, fine, strict=True):
             begin, end = end, end + between.size
             distance = np.abs(1.0 - model.acceleration(between.ravel()) * path[begin:end])
             modulus = min(modulus, float(distance.min(initial=math.inf)))
-        return Margins(modulus, delay if delay < math.inf else None)
+            distance = distance.reshape(between.shape)
+            at = np.argmin(distance, axis=0), np.arange(between.shape[1])
+            bottoms.append(between[at][distance[at] < below])
+        return Margins(modulus, delay if delay < math.inf else None), np.unique(np.concatenate(bottoms))
 
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of all models [1/s]; below 0 is stable."""
