@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from tuning.campaign.batch import Case, run_cases
+from tuning.campaign.batch import run_cases
 from tuning.campaign.figures import passive_motion
 from tuning.campaign.kernel import (
     CURRENT_PEAK,
@@ -124,7 +124,9 @@ def by_the_kernel(campaign: Campaign, numbers: list[int]) -> tuple[np.ndarray, n
 
 VARIANTS = {
     "as it is": lambda text: text,
-    "whole samples of delay": lambda text: re.sub(r"low = 20.0\nhigh = 250.0", "low = 200.0\nhigh = 200.0", text),
+    "whole samples of delay": lambda text: re.sub(
+        r"low = 20.0\nhigh = 250.0", "low = 200.0\nhigh = 200.0", text
+    ),
     "absolute": lambda text: text.replace("seed = 3", 'seed = 3\nmeasurement = "absolute"'),
     "noise": lambda text: text.replace("seed = 3", "seed = 3\nsensor_noise = true"),
     "steps": lambda text: text.replace(
@@ -184,14 +186,21 @@ def test_a_row_states_the_poles_margins_and_powers_of_its_case() -> None:
         assert row["stable"] == (row["growth_1_s"] < 0.0)
         if row["stable"]:
             grid = mode_grid(model, 36)
-            found = [margins(model.loop_terms(grid, g.low_pass_hz, g.high_pass_hz), grid, g) for g in gains.values()]
+            found = [
+                margins(model.loop_terms(grid, g.low_pass_hz, g.high_pass_hz), grid, g)
+                for g in gains.values()
+            ]
             assert row["modulus_margin"] == pytest.approx(min(m.modulus for m in found))
-            assert row["delay_margin_s"] == pytest.approx(min(m.delay_s for m in found if m.delay_s is not None))
+            assert row["delay_margin_s"] == pytest.approx(
+                min(m.delay_s for m in found if m.delay_s is not None)
+            )
         wanted, _ = by_the_rig(campaign, row["case"])
         window = wanted[-10:].sum(axis=0) / 10_000
         heat = case.coil.resistance_ohm * window[CURRENT_SQUARES]
         assert row["joule_mean_w"] >= heat * (1.0 - CLOSE)
-        assert row["joule_peak_w"] == pytest.approx(case.coil.resistance_ohm * wanted[:, CURRENT_PEAK].max() ** 2)
+        assert row["joule_peak_w"] == pytest.approx(
+            case.coil.resistance_ohm * wanted[:, CURRENT_PEAK].max() ** 2
+        )
         assert row["drawn loop.delay_us"] == pytest.approx(1e6 * case.facts.delay_s)
 
 
@@ -342,7 +351,9 @@ def test_interrupting_leaves_what_is_done(tmp_path: Path) -> None:
     assert sum(pq.read_table(p).num_rows for p in kept) == TILE * len(kept)
 
 
-def test_a_case_runs_again_alone_and_can_be_recorded(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_a_case_runs_again_alone_and_can_be_recorded(
+    finished: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     path, result = finished
     worst = result["worst"][0]["case"]
     out = tmp_path / "case.rrd"
@@ -355,14 +366,20 @@ def test_a_case_runs_again_alone_and_can_be_recorded(finished: tuple[Path, dict[
     assert found["row"] == row
     recording = open_recording(out)
     assert recording.end_sample == 15_000
-    current = np.concatenate([b.values[:, [c.name for c in b.channels].index("vcm_current")] for b in recording.blocks()])
+    current = np.concatenate(
+        [b.values[:, [c.name for c in b.channels].index("vcm_current")] for b in recording.blocks()]
+    )
     assert np.abs(current).max() == pytest.approx(row["current_peak_a"], rel=1e-6)
 
 
-def test_an_archive_is_replayed_recording_by_recording(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_an_archive_is_replayed_recording_by_recording(
+    finished: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     path, _ = finished
     for k in (0, 1):
-        CliRunner().invoke(app, ["campaign", str(path), "--replay", str(k), "--recording", str(tmp_path / f"{k}.rrd")])
+        CliRunner().invoke(
+            app, ["campaign", str(path), "--replay", str(k), "--recording", str(tmp_path / f"{k}.rrd")]
+        )
     (tmp_path / "broken.rrd").write_bytes(b"no recording")
     spec = tmp_path / "archive.toml"
     spec.write_text('name = "archive"\n[archive]\nrecordings = "*.rrd"\n', encoding="utf-8")
@@ -393,9 +410,21 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     dask = [sys.executable, "-m", "dask"]
     port = address.rsplit(":", 1)[1]
     started = [
-        subprocess.Popen([*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"], **common)
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"], **common
+        )
     ]
-    worker = [*dask, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
+    worker = [
+        *dask,
+        "worker",
+        address,
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--no-dashboard",
+        "--host",
+        "127.0.0.1",
+    ]
     try:
         started += [subprocess.Popen(worker, **common) for _ in range(3)]
         yield address, started[1:]

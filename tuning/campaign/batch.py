@@ -8,7 +8,16 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import expm
 
-from tuning.campaign.kernel import FIGURES, INPUTS, MEMORY, POWER_WINDOW_BLOCKS, TILE, rows_of, run_spans, terms_of
+from tuning.campaign.kernel import (
+    FIGURES,
+    INPUTS,
+    MEMORY,
+    POWER_WINDOW_BLOCKS,
+    TILE,
+    rows_of,
+    run_spans,
+    terms_of,
+)
 from tuning.loop import LoopFacts
 from twin.control.schedule import GainSchedule
 from twin.plant.config import DampingTable, Plant, VoiceCoil
@@ -181,12 +190,12 @@ def _run_tile(cases: Sequence[Case], lanes: Sequence[_Lane], excitation: Excitat
         np.zeros(3),
     )  # fmt: skip
     figures = np.zeros((len(spans), FIGURES * TILE))
-    coefficients, gains = coefficients.reshape(nodes, -1), gains.reshape(len(spans), 2, -1)
+    plants, laws = coefficients.reshape(nodes, -1), gains.reshape(len(spans), 2, -1)
     shape = np.concatenate([[0.0], excitation.samples])
     places = np.array(lanes[0].places, dtype=np.int64)
     for part, noise in _noises(cases, lanes, spans):
         run_spans(
-            coefficients, weights[part], gains[part], acts[part], spans[part], shape, noise, constants,
+            plants, weights[part], laws[part], acts[part], spans[part], shape, noise, constants,
             places, delays, *state, figures[part], 1.0 / fs, n, terms,
         )  # fmt: skip
     tripped = guard[-1, :width]
@@ -201,7 +210,7 @@ def _noises(cases: Sequence[Case], lanes: Sequence[_Lane], spans: Array) -> Iter
     generators = [np.random.default_rng(case.noise_seed) for case in cases]
     ends = np.nonzero(spans[:, 2])[0] + 1
     first = 0
-    for last in ends[NOISE_BLOCKS - 1 :: NOISE_BLOCKS].tolist() + [len(spans)]:
+    for last in [*ends[NOISE_BLOCKS - 1 :: NOISE_BLOCKS].tolist(), len(spans)]:
         if last <= first:
             continue
         count = int(spans[last - 1, 1] - spans[first, 0])
@@ -224,13 +233,15 @@ def _lane(case: Case) -> _Lane:
     at = {s.of: k for k, s in reversed(list(enumerate(plant.sensor))) if s.kind == "acceleration"}
     first, second = coil.between or ("", "")
     if second not in at or (facts.relative and first not in at):
+        bare = first if second in at else second
         raise InputError(
-            f"plant '{plant.name}': the control law needs an accelerometer on body '{first if second in at else second}'; "
+            f"plant '{plant.name}': the control law needs an accelerometer on body '{bare}'; "
             'add a [[sensor]] with kind = "acceleration"'
         )
     pair = (at.get(first, at[second]), at[second])
     sensors = list(pair)
-    rows, states = [], ()
+    rows: list[Array] = []
+    states: tuple[str, ...] = ()
     for damping in nodes:
         own = {} if absorber is None else {absorber.name: float(damping)}
         model = linear_model(plant, frequency_hz=None, damping_ns_m=own)
@@ -250,7 +261,9 @@ def _lane(case: Case) -> _Lane:
         -1.0, coil.force_constant_n_a, coil.inductance_h, case.limit("stroke_m"),
         case.limit(f"{coil.name}_power_w") / coil.resistance_ohm,
     ])  # fmt: skip
-    names = [f"x_{plant.primary.name}"] + [f"{q}_{p}" for p in (second, first) for q in "xv"] + [f"i_{coil.name}"]
+    names = (
+        [f"x_{plant.primary.name}"] + [f"{q}_{p}" for p in (second, first) for q in "xv"] + [f"i_{coil.name}"]
+    )
     places = tuple(states.index(name) if name in states else -1 for name in names)
     std = np.zeros(len(plant.sensor))
     if case.noise_seed is not None:
@@ -292,7 +305,9 @@ def _damping_nodes(plant: Plant, sample_rate_hz: float) -> Array:
         return np.array([low])
     lightest = min(body.mass_kg for body in plant.body)
     reach, count = (high - low) / lightest / sample_rate_hz, 2
-    while count < MOST_NODES and reach**count / (math.factorial(count) * 2.0 ** (count - 1)) > INTERPOLATED_TO:
+    while (
+        count < MOST_NODES and reach**count / (math.factorial(count) * 2.0 ** (count - 1)) > INTERPOLATED_TO
+    ):
         count += 1
     points = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * points)
@@ -315,9 +330,8 @@ def _weights(case: Case, nodes: Array, frequency_hz: Array) -> Array:
 
 def _packed(schedule: GainSchedule, force_constant_n_a: float, excitation: Excitation) -> Array:
     """Gains and cutoffs of every span's ends in the kernel's units, (S, 2, 5)."""
-    return _table(schedule, excitation.sample_rate_hz, excitation.edges_hz.tobytes()) / np.array(
-        [force_constant_n_a] * 3 + [1.0, 1.0]
-    )
+    table = _table(schedule, excitation.sample_rate_hz, excitation.edges_hz.tobytes())
+    return np.asarray(table / np.array([force_constant_n_a] * 3 + [1.0, 1.0]))
 
 
 @lru_cache(maxsize=8)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuning.campaign.batch import Case, Excitation
 from tuning.campaign.kernel import (
@@ -21,7 +22,9 @@ from tuning.campaign.kernel import (
 from tuning.loop import RigModel, margins, mode_grid
 from tuning.types import BudgetKind
 from twin.plant.config import DampingTable
-from twin.plant.linear import Array, linear_model
+from twin.plant.linear import Array, ComplexArray, linear_model
+
+Flags = NDArray[np.bool_]
 
 MARGIN_POINTS = 36
 """On either side of each mode, see `tuning.loop.mode_grid`."""
@@ -145,7 +148,9 @@ class Judge:
         taken = joule + run[:, MOTION_WORK] + run[:, STORED] * fs
         peak = coil.resistance_ohm * run[:, CURRENT_PEAK] ** 2
         mean_joule, mean_taken = self._windowed(joule), self._windowed(taken)
-        spent = {"joule_mean": mean_joule, "joule_peak": peak, "electrical": mean_taken}[self._goal.budget_kind]
+        spent = {"joule_mean": mean_joule, "joule_peak": peak, "electrical": mean_taken}[
+            self._goal.budget_kind
+        ]
         first, when = self._first_limit(case, run, spent, mean_joule, settled, reduced)
         return CaseFigures(
             attenuation_mean=float(reduced.mean()) if len(reduced) else None,
@@ -168,7 +173,7 @@ class Judge:
             meets=not first and growth < 0.0,
         )
 
-    def _settled(self, controlled: Array, acting: Array) -> Array:
+    def _settled(self, controlled: Array, acting: Flags) -> Flags:
         """(S,) whether a span's motion counts: the schedule acts, and nothing was switched or jumped lately."""
         switched = np.concatenate([[True], controlled[1:] != controlled[:-1]]) | self._jump
         begin_s = self._excitation.spans[:, 0] / self._excitation.sample_rate_hz
@@ -183,12 +188,12 @@ class Judge:
         begin = np.maximum(0, k - POWER_WINDOW_BLOCKS)
         return np.asarray((total[k] - total[begin]) / (count[k] - count[begin]))
 
-    def _passive(self, case: Case, settled: Array) -> Array:
+    def _passive(self, case: Case, settled: Flags) -> Array:
         """Motion of the passive rig in steady state at the settled spans [m]."""
         return passive_motion(case, self._excitation.middle_hz[settled])
 
     def _first_limit(
-        self, case: Case, run: Array, spent: Array, mean_joule: Array, settled: Array, reduced: Array
+        self, case: Case, run: Array, spent: Array, mean_joule: Array, settled: Flags, reduced: Array
     ) -> tuple[str, float | None]:
         goal, limits, coil = self._goal, case.plant.limits, case.coil
         broken = {
@@ -251,15 +256,16 @@ def _slowest(case: Case, models: Sequence[tuple[float, RigModel]]) -> tuple[floa
 def _margins(case: Case, models: Sequence[tuple[float, RigModel]]) -> tuple[float, float | None]:
     """Least modulus and delay margin over the grid, see `tuning.loop.margins`."""
     modulus, delay = (math.inf, math.inf) if models else (1.0, math.inf)
-    grid = acceleration = None
+    grid: Array = np.zeros(0)
+    acceleration: ComplexArray = np.zeros(0, dtype=np.complex128)
     before: RigModel | None = None
     for f, model in models:
         if model is not before:
             grid = mode_grid(model, MARGIN_POINTS)
             acceleration, before = model.acceleration(grid), model
         gains = case.schedule.at(f)
-        terms = -np.asarray(acceleration)[:, None] * model.paths(grid, gains.low_pass_hz, gains.high_pass_hz)
-        found = margins(terms, np.asarray(grid), gains)
+        terms = -acceleration[:, None] * model.paths(grid, gains.low_pass_hz, gains.high_pass_hz)
+        found = margins(terms, grid, gains)
         modulus = min(modulus, found.modulus)
         delay = min(delay, math.inf if found.delay_s is None else found.delay_s)
     return modulus, delay if math.isfinite(delay) else None

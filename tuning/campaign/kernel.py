@@ -9,10 +9,13 @@ that rows do not overlap; with the rows' distance in a variable it falls back on
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.control.chain import SQRT2
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array
+
+Whole = NDArray[np.int64]
 
 TILE = 72
 """Cases side by side. Rows a power of two apart would fall on each other in the first-level cache."""
@@ -24,22 +27,43 @@ INPUTS = 4
 """Beside the states: last and present command of the coil, last and present excitation."""
 
 FIGURES = 8
-(X_PEAK, STROKE_PEAK, CURRENT_PEAK, CURRENT_SQUARES, MOTION_WORK, STORED, SATURATED, CONTROLLED) = range(FIGURES)
+(X_PEAK, STROKE_PEAK, CURRENT_PEAK, CURRENT_SQUARES, MOTION_WORK, STORED, SATURATED, CONTROLLED) = range(
+    FIGURES
+)
 """Rows of the figures of a span: largest |x1| and |x_r| [m] and |i| [A], sum of i² [A²], sum of k i (x2' - x1') [W],
 L/2 (i_end² - i_before²) [J], samples with the reference at its clamp, and whether control acted."""
 
 POWER_WINDOW_BLOCKS = 10
 
-(A_LOW, B_LOW, A_VELOCITY, B_VELOCITY, A_POSITION, B_POSITION, ACCELERATION, COMMAND, ACTING, STROKE, SPEED) = (
-    row * TILE for row in range(11)
-)
+(
+    A_LOW,
+    B_LOW,
+    A_VELOCITY,
+    B_VELOCITY,
+    A_POSITION,
+    B_POSITION,
+    ACCELERATION,
+    COMMAND,
+    ACTING,
+    STROKE,
+    SPEED,
+) = (row * TILE for row in range(11))
 (G_LOW, D_LOW, G_HIGH, D_HIGH, SCALE) = (row * TILE for row in range(11, 16))
 MEMORY = 16 * TILE
-"""Rows of a tile's memory: six states of the filter chain, what is computed on the way, and the chain's coefficients."""
+"""Rows of a tile's memory: states of the filter chain, what is computed on the way, the chain's coefficients."""
 
-(AMPLITUDE, CLAMP, RANGE_1, WEIGHT_1, RANGE_2, WEIGHT_2, FORCE_CONSTANT, INDUCTANCE, MOST_STROKE, MOST_HEATING) = range(
-    10
-)
+(
+    AMPLITUDE,
+    CLAMP,
+    RANGE_1,
+    WEIGHT_1,
+    RANGE_2,
+    WEIGHT_2,
+    FORCE_CONSTANT,
+    INDUCTANCE,
+    MOST_STROKE,
+    MOST_HEATING,
+) = range(10)
 """Rows of a tile's constants: see `run_spans`."""
 
 
@@ -138,7 +162,9 @@ def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w
     # In stages: a chain of operations that wait for each other is short enough for several lanes to overlap.
     for c in range(TILE):
         g_low = memory[G_LOW + c]
-        band = (memory[A_LOW + c] + g_low * (memory[ACCELERATION + c] - memory[B_LOW + c])) * memory[D_LOW + c]
+        band = (memory[A_LOW + c] + g_low * (memory[ACCELERATION + c] - memory[B_LOW + c])) * memory[
+            D_LOW + c
+        ]
         a = memory[B_LOW + c] + g_low * band
         memory[A_LOW + c] = 2.0 * band - memory[A_LOW + c]
         memory[B_LOW + c] = 2.0 * a - memory[B_LOW + c]
@@ -154,9 +180,9 @@ def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w
         memory[SPEED + c] = memory[SCALE + c] * band
     for c in range(TILE):
         g_high = memory[G_HIGH + c]
-        band = (
-            memory[A_POSITION + c] + g_high * (memory[SPEED + c] - memory[B_POSITION + c])
-        ) * memory[D_HIGH + c]
+        band = (memory[A_POSITION + c] + g_high * (memory[SPEED + c] - memory[B_POSITION + c])) * memory[
+            D_HIGH + c
+        ]
         low = memory[B_POSITION + c] + g_high * band
         memory[A_POSITION + c] = 2.0 * band - memory[A_POSITION + c]
         memory[B_POSITION + c] = 2.0 * low - memory[B_POSITION + c]
@@ -175,12 +201,15 @@ def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w
 
 
 @kernel
-def _gather(z: Array, held: Array, memory: Array, figures: Array, places: Array, constants: Array) -> None:
+def _gather(z: Array, held: Array, memory: Array, figures: Array, places: Whole, constants: Array) -> None:
     """Add a sample to the figures of a span."""
     x, i = z[places[0] * TILE : (places[0] + 1) * TILE], z[places[5] * TILE : (places[5] + 1) * TILE]
     end, end_v = z[places[1] * TILE : (places[1] + 1) * TILE], z[places[2] * TILE : (places[2] + 1) * TILE]
     if places[3] >= 0:
-        base, base_v = z[places[3] * TILE : (places[3] + 1) * TILE], z[places[4] * TILE : (places[4] + 1) * TILE]
+        base, base_v = (
+            z[places[3] * TILE : (places[3] + 1) * TILE],
+            z[places[4] * TILE : (places[4] + 1) * TILE],
+        )
         for c in range(TILE):
             memory[STROKE + c] = end[c] - base[c]
         for c in range(TILE):
@@ -212,8 +241,8 @@ def run_spans(
     shape: Array,
     noise: Array,
     constants: Array,
-    places: Array,
-    delays: Array,
+    places: Whole,
+    delays: Whole,
     blended: Array,
     z: Array,
     memory: Array,
@@ -230,8 +259,8 @@ def run_spans(
     Parameters
     ----------
     coefficients
-        (Q, (rows_of(n) + 2) * terms * TILE) discrete plants at Q values of the absorber's damping: for each of the n states and
-        both accelerometers its factors of states, last and present command, last and present excitation.
+        (Q, (rows_of(n) + 2) * terms * TILE) discrete plants at Q values of the absorber's damping: for each state and
+        both accelerometers the factors of states, last and present command, last and present excitation.
     weights
         (S, Q, TILE) share of each of them in a span.
     gains

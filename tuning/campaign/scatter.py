@@ -18,7 +18,13 @@ MOST_TRIES = 1000
 LOOP_DELAY, AMPLITUDE = "loop.delay_us", "excitation.amplitude"
 
 OF_BODIES = ("mass_kg", "stiffness_n_m", "damping_ns_m")
-OF_ACTUATORS = ("force_constant_n_a", "resistance_ohm", "inductance_h", "current_loop_kp_v_a", "force_constant_n_v")
+OF_ACTUATORS = (
+    "force_constant_n_a",
+    "resistance_ohm",
+    "inductance_h",
+    "current_loop_kp_v_a",
+    "force_constant_n_v",
+)
 OF_SENSORS = ("noise_density",)
 
 
@@ -76,7 +82,9 @@ class Normal(_Scatter):
             value = float(rng.normal(self.mean, self.std))
             if value > 0.0:
                 return value
-        raise InputError(f"scatter {self.parameter}: std {self.std:g} leaves hardly a value above 0; make it smaller")
+        raise InputError(
+            f"scatter {self.parameter}: std {self.std:g} leaves hardly a value above 0; make it smaller"
+        )
 
 
 class LogNormal(_Scatter):
@@ -99,9 +107,7 @@ def stream(seed: int, draw: int, what: str) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(draw, zlib.crc32(what.encode())))
 
 
-def draw_factors(
-    scatter: tuple[Uniform | Normal | LogNormal, ...], seed: int, draw: int
-) -> dict[str, float]:
+def draw_factors(scatter: tuple[Uniform | Normal | LogNormal, ...], seed: int, draw: int) -> dict[str, float]:
     """What one draw gives each parameter: a factor or a value, as its scale says."""
     return {s.parameter: s.draw(np.random.default_rng(stream(seed, draw, s.parameter))) for s in scatter}
 

@@ -11,7 +11,14 @@ from tuning.types import BudgetKind
 from twin.plant.linear import Array
 
 POWER_OF = {"joule_mean": "joule_mean_w", "joule_peak": "joule_peak_w", "electrical": "electrical_mean_w"}
-RESULTS = ("attenuation_mean", "attenuation_worst", "displacement_m", "joule_mean_w", "growth_1_s", "modulus_margin")
+RESULTS = (
+    "attenuation_mean",
+    "attenuation_worst",
+    "displacement_m",
+    "joule_mean_w",
+    "growth_1_s",
+    "modulus_margin",
+)
 DRAWN = "drawn "
 STEPS = 60
 FEWEST = 8

@@ -45,7 +45,9 @@ def run_archive(
     if spec.archive is None:
         raise InputError("archive: missing")
     if options.scheduler is not None:
-        raise InputError("--scheduler: recordings lie on this machine; leave it out to replay them on its threads")
+        raise InputError(
+            "--scheduler: recordings lie on this machine; leave it out to replay them on its threads"
+        )
     paths = recordings_of(spec.archive.recordings, options.spec.parent)
     listed = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in paths]
     text = json.dumps([spec.model_dump(mode="json"), listed], sort_keys=True)

@@ -82,9 +82,15 @@ class Campaign:
     @property
     def jobs(self) -> list[Job]:
         """All the work, in pieces of a tile."""
-        size = RETUNED_TOGETHER if isinstance(self.spec.schedule, Retuned) and self.spec.schedule.per_case else TILE
+        size = (
+            RETUNED_TOGETHER
+            if isinstance(self.spec.schedule, Retuned) and self.spec.schedule.per_case
+            else TILE
+        )
         pieces = [
-            (c, first) for c in range(len(self.spec.combinations)) for first in range(0, self.spec.draws, size)
+            (c, first)
+            for c in range(len(self.spec.combinations))
+            for first in range(0, self.spec.draws, size)
         ]
         return [Job(k, c, first, min(first + size, self.spec.draws)) for k, (c, first) in enumerate(pieces)]
 
@@ -117,7 +123,10 @@ def prepare(spec: CampaignSpec, folder: Path, say: Callable[[str], None]) -> Cam
     for plant in plants:
         for s in spec.scatter:
             check_parameter(s.parameter, plant)
-    for key, text in (("report_hz", spec.report_hz), ("schedule.at_hz", getattr(spec.schedule, "at_hz", "45"))):
+    for key, text in (
+        ("report_hz", spec.report_hz),
+        ("schedule.at_hz", getattr(spec.schedule, "at_hz", "45")),
+    ):
         try:
             parse_frequencies(text)
         except InputError as error:
@@ -138,7 +147,9 @@ def prepare(spec: CampaignSpec, folder: Path, say: Callable[[str], None]) -> Cam
             found, refused = _schedule(spec, plant, facts, excitation.amplitude, budget)
             if refused:
                 at = ", ".join(f"{f:g}" for f in refused)
-                say(f"{plant.name}, {spec.budgets_w[budget]:g} W: the tuner has no gains at {at} Hz; none act there")
+                say(
+                    f"{plant.name}, {spec.budgets_w[budget]:g} W: the tuner has no gains at {at} Hz; none act there"
+                )
             schedules.append(found)
     campaign = Campaign(spec, plants, tuple(schedules))
     _check(campaign)
@@ -170,7 +181,8 @@ def drawn_case(campaign: Campaign, number: int) -> Drawn:
     own_plant = scattered_plant(plant, spec.scatter, drawn)
     facts = _facts(spec, values.get(LOOP_DELAY, spec.delay_us))
     amplitude = values.get(AMPLITUDE, excitation.amplitude)
-    schedule, refused = campaign.schedules[combination], ()
+    schedule = campaign.schedules[combination]
+    refused: tuple[float, ...] = ()
     if schedule is None:
         schedule, refused = _schedule(spec, own_plant, facts, amplitude, budget)
     seed = noise_seed(spec.seed, draw) if spec.sensor_noise else None
@@ -178,7 +190,9 @@ def drawn_case(campaign: Campaign, number: int) -> Drawn:
     return Drawn(number, draw, values, case, refused)
 
 
-def run_job(campaign: Campaign, job: Job, stopped: Callable[[], bool] = lambda: False) -> list[dict[str, Any]]:
+def run_job(
+    campaign: Campaign, job: Job, stopped: Callable[[], bool] = lambda: False
+) -> list[dict[str, Any]]:
     """Rows of a job's cases; none if it was told to stop."""
     spec = campaign.spec
     p, budget, e = spec.combinations[job.combination]
@@ -302,12 +316,17 @@ def _from_file(rule: FromFile, folder: Path, plant: Plant, say: Callable[[str], 
     # It names another plant, or none: the campaign may well ask what its gains do on this one.
     text = json.loads(path.read_text(encoding="utf-8")) if path.suffix == ".json" else {}
     if "points" not in text:
-        raise InputError(f"schedule file: {path}: cannot be used for plant '{plant.name}'; export it for that plant")
+        raise InputError(
+            f"schedule file: {path}: cannot be used for plant '{plant.name}'; export it for that plant"
+        )
     rows = [p for p in text["points"] if p.get("gains") and p.get("cutoffs")]
     try:
         columns = {
             key: tuple(p[part][key] for p in rows)
-            for part, keys in (("gains", ("alpha_kg", "beta_ns_m", "gamma_n_m")), ("cutoffs", ("low_pass_hz", "high_pass_hz")))
+            for part, keys in (
+                ("gains", ("alpha_kg", "beta_ns_m", "gamma_n_m")),
+                ("cutoffs", ("low_pass_hz", "high_pass_hz")),
+            )
             for key in keys
         }
         hz = tuple(p["frequency_hz"] for p in rows)
@@ -320,13 +339,19 @@ def _check(campaign: Campaign) -> None:
     """Say now what would stop every case."""
     spec = campaign.spec
     if spec.block_s * spec.sample_rate_hz < 10.0:
-        raise InputError(f"block_s [s]: a block of {spec.block_s:g} s has fewer than 10 samples; make it longer")
+        raise InputError(
+            f"block_s [s]: a block of {spec.block_s:g} s has fewer than 10 samples; make it longer"
+        )
     for combination, (p, _, e) in enumerate(spec.combinations):
         plant, excitation = campaign.plants[p], spec.excitation[e]
         if excitation.duration_s < spec.block_s:
-            raise InputError(f"excitation[{e}] duration_s [s]: must be at least a block of {spec.block_s:g} s")
+            raise InputError(
+                f"excitation[{e}] duration_s [s]: must be at least a block of {spec.block_s:g} s"
+            )
         if excitation.duration_s * spec.sample_rate_hz > 1e8:
-            raise InputError(f"excitation[{e}] duration_s [s]: {excitation.duration_s:g} s is longer than a run may be")
+            raise InputError(
+                f"excitation[{e}] duration_s [s]: {excitation.duration_s:g} s is longer than a run may be"
+            )
         schedule = campaign.schedules[combination]
         fastest = max(schedule.low_pass_hz + schedule.high_pass_hz) if schedule is not None else 0.0
         if fastest >= 0.5 * spec.sample_rate_hz:
@@ -334,7 +359,8 @@ def _check(campaign: Campaign) -> None:
                 f"schedule: cutoff {fastest:g} Hz is not below half of sample_rate_hz ({spec.sample_rate_hz:g} Hz); "
                 "give low_pass_hz or a faster rate"
             )
-        case = drawn_case(replace(campaign, schedules=tuple(s or _nothing() for s in campaign.schedules)), combination * spec.draws).case
+        known = replace(campaign, schedules=tuple(s or _nothing() for s in campaign.schedules))
+        case = drawn_case(known, combination * spec.draws).case
         coil = case.coil
         for key in ("stroke_m", f"{coil.name}_current_a", f"{coil.name}_power_w"):
             case.limit(key)

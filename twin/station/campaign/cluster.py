@@ -11,7 +11,9 @@ LIVES = 3
 """A job is given to another worker when its own dies, and tried so often again if it fails."""
 
 
-def run_on_cluster(address: str, campaign: Campaign, jobs: Sequence[Job]) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
+def run_on_cluster(
+    address: str, campaign: Campaign, jobs: Sequence[Job]
+) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
     """Run jobs on a cluster and yield them with their rows as they finish.
 
     Raises
@@ -22,13 +24,15 @@ def run_on_cluster(address: str, campaign: Campaign, jobs: Sequence[Job]) -> Ite
         If the cluster loses its workers, or a job fails on it.
     """
     try:
-        from distributed import Client, as_completed
+        import distributed
     except ImportError as error:
         raise InputError(
             '--scheduler: needs the library "distributed"; install it with pip install "atmd-twin[cluster]"'
         ) from error
+    connect: Any = distributed.Client
+    in_turn: Any = distributed.as_completed
     try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+        client: Any = connect(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError(
             f"--scheduler {address}: no Dask scheduler answers there ({error}); start one with 'dask scheduler' and "
@@ -42,13 +46,15 @@ def run_on_cluster(address: str, campaign: Campaign, jobs: Sequence[Job]) -> Ite
                 f"--scheduler {address}: no worker came within {FIRST_WORKER_S:g} s; start some with "
                 f"'dask worker {address} --nthreads 1'"
             ) from error
-        futures = {
-            client.submit(run_job, campaign, job, pure=False, retries=LIVES, key=f"{campaign.fingerprint}-{job.number}"): job
-            for job in jobs
-        }
-        for future in as_completed(list(futures), loop=client.loop):
+        name, futures = campaign.fingerprint, {}
+        for job in jobs:
+            key = f"{name}-{job.number}"
+            futures[client.submit(run_job, campaign, job, pure=False, retries=LIVES, key=key)] = job
+        for future in in_turn(list(futures), loop=client.loop):
             if future.status != "finished":
-                raise RunError(f"--scheduler {address}: job {futures[future].number} failed ({future.exception()!r})")
+                raise RunError(
+                    f"--scheduler {address}: job {futures[future].number} failed ({future.exception()!r})"
+                )
             rows = future.result()
             yield futures[future], rows
             future.release()

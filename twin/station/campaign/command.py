@@ -21,18 +21,25 @@ from twin.station.terminal import (
 
 
 def campaign(
-    spec: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="What is asked, see docs/examples/campaign.toml.")],
+    spec: Annotated[
+        Path, typer.Argument(metavar="SPEC.toml", help="What is asked, see docs/examples/campaign.toml.")
+    ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of the results; SPEC.campaign beside the specification if not given."),
+        typer.Option(
+            metavar="DIR", help="Folder of the results; SPEC.campaign beside the specification if not given."
+        ),
     ] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads; one per core if not given.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786."),
+        typer.Option(
+            metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786."
+        ),
     ] = None,
     replay: Annotated[
-        int | None, typer.Option(min=0, metavar="CASE", help="Run this one case on the simulated rig instead.")
+        int | None,
+        typer.Option(min=0, metavar="CASE", help="Run this one case on the simulated rig instead."),
     ] = None,
     recording: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="With --replay: record the case here.")
@@ -80,25 +87,26 @@ def _replay(spec_path: Path, case: int, recording: Path | None) -> dict[str, Any
 
 
 def _table(r: dict[str, Any]) -> Table:
-    table = Table("", "", box=box.SIMPLE, show_header=False, title=f"Campaign {r['name']}", title_justify="left")
+    table = Table(
+        "", "", box=box.SIMPLE, show_header=False, title=f"Campaign {r['name']}", title_justify="left"
+    )
     table.add_row("cases", f"{r['cases']}, {r['computed']} of them now in {r['seconds']:.1f} s")
     table.add_row("keep everything", f"{r['meeting']}  ({percent(r['meeting'] / max(r['cases'], 1))})")
     table.add_row("stable on the whole grid", str(r["stable"]))
     table.add_row("limit broken first", ", ".join(f"{k} {v}" for k, v in r["first_limits"].items()))
     for point in r["yields"] if len(r["yields"]) <= 12 else []:
         what = f"yield, {point['plant']}, {point['budget_w']:g} W"
-        table.add_row(what, f"{percent(point['share'])}  ({percent(point['low'])} to {percent(point['high'])})")
+        table.add_row(
+            what, f"{percent(point['share'])}  ({percent(point['low'])} to {percent(point['high'])})"
+        )
     for result, found in r["sensitivities"].items():
         ranked = sorted((k for k in found if k), key=lambda k: -abs(found[k]["regression"]))[:3]
-        table.add_row(
-            f"{result} depends on", ", ".join(f"{k} {found[k]['regression']:+.2f}" for k in ranked)
-        )
+        table.add_row(f"{result} depends on", ", ".join(f"{k} {found[k]['regression']:+.2f}" for k in ranked))
     for row in r["worst"][:3]:
-        growth = "" if row["stable"] else f", unstable {number(row['growth_1_s'])} 1/s"
-        table.add_row(
-            f"worst: case {row['case']}",
-            f"{percent(row['attenuation_worst'])} attenuation at worst, first limit {row['first_limit'] or '-'}{growth}",
-        )
+        words = f"{percent(row['attenuation_worst'])} attenuation at worst, first limit {row['first_limit'] or '-'}"
+        if not row["stable"]:
+            words += f", unstable {number(row['growth_1_s'])} 1/s"
+        table.add_row(f"worst: case {row['case']}", words)
     table.add_row("results", r["results"])
     if "report" in r:
         table.add_row("report", r["report"])

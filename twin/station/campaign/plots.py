@@ -115,7 +115,9 @@ def _sensitivity_figure(sensitivities: dict[str, dict[str, dict[str, float]]]) -
     results = list(sensitivities)
     parameters = sorted(
         {name for found in sensitivities.values() for name in found if name},
-        key=lambda name: max(abs(found[name]["regression"]) for found in sensitivities.values() if name in found),
+        key=lambda name: max(
+            abs(found[name]["regression"]) for found in sensitivities.values() if name in found
+        ),
     )[-SHOWN_PARAMETERS:]
     columns = min(3, len(results))
     lines = -(-len(results) // columns)
@@ -142,7 +144,9 @@ def _page(spec: CampaignSpec, result: dict[str, Any], drawn: dict[str, bytes], s
     def text(value: object) -> str:
         if isinstance(value, bool):
             return "yes" if value else "no"
-        return html.escape("-" if value in (None, "") else f"{value:.4g}" if isinstance(value, float) else str(value))
+        return html.escape(
+            "-" if value in (None, "") else f"{value:.4g}" if isinstance(value, float) else str(value)
+        )
 
     worst = result["worst"]
     head = "".join(f"<th>{html.escape(key.replace('_', ' '))}</th>" for key in (worst[0] if worst else {}))
@@ -168,4 +172,3 @@ whole grid. Results of every case are in <code>cases.parquet</code> beside this 
 <p>Any of them runs again, alone: <code>{html.escape(command)}</code></p>
 <h2>What was asked</h2><pre>{described}</pre></body></html>
 """
-

@@ -128,7 +128,10 @@ def replay_case(
         goal = replace(goal, budget_w=row["budget_w"])
     # The twin watches and proposes nothing: what the case's own schedule does is what is asked.
     settings = SessionSettings(
-        loop=drawn.case.facts, schedule=drawn.case.schedule, goal=goal, retuning=RetuningSettings(every_blocks=NEVER)
+        loop=drawn.case.facts,
+        schedule=drawn.case.schedule,
+        goal=goal,
+        retuning=RetuningSettings(every_blocks=NEVER),
     )
     session = Session(_model_of(drawn, programme), rig.channels, spec.sample_rate_hz, settings)
     log = RunLog()

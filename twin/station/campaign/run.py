@@ -4,7 +4,7 @@ import glob
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,6 +20,11 @@ from twin.station.campaign.store import Store
 
 WORST = 10
 """So many of the worst cases are listed."""
+
+LISTED = (
+    "case", "plant", "budget_w", "stable", "growth_1_s", "attenuation_worst", "attenuation_mean", "displacement_m",
+    "first_limit", "first_limit_s",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,20 +121,13 @@ def summary(spec: CampaignSpec, rows: Sequence[dict[str, Any]]) -> dict[str, Any
         "first_limits": {key or "none": limits[key] for key in sorted(limits)},
         "yields": yields(rows, spec.budget_kind, bool(spec.budgets_w)),
         "sensitivities": sensitivities(rows),
-        "worst": [
-            {
-                key: row[key]
-                for key in ("case", "plant", "budget_w", "stable", "growth_1_s", "attenuation_worst", "attenuation_mean",
-                            "displacement_m", "first_limit", "first_limit_s")
-            }
-            for row in worst_first(rows)[:WORST]
-        ],
-    }  # fmt: skip
+        "worst": [{key: row[key] for key in LISTED} for row in worst_first(rows)[:WORST]],
+    }
 
 
 def _finished(
     options: CampaignOptions, campaign: Campaign, jobs: Sequence[Job]
-) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
+) -> Generator[tuple[Job, list[dict[str, Any]]], None, None]:
     """Jobs with their rows, as they finish."""
     if not jobs:
         return
@@ -160,5 +158,5 @@ def recordings_of(pattern: str, folder: Path) -> list[Path]:
     """
     found = sorted(Path(p) for p in glob.glob(str(folder / pattern), recursive=True) if Path(p).is_file())
     if not found:
-        raise InputError(f"archive.recordings = \"{pattern}\": no such file in {folder}; check the pattern")
+        raise InputError(f'archive.recordings = "{pattern}": no such file in {folder}; check the pattern')
     return found

@@ -64,7 +64,7 @@ Schedule = Annotated[ThesisRule | Retuned | FromFile, Field(discriminator="kind"
 
 
 class GoalSpec(Frozen):
-    """What a case must keep to count, beside the plant's limits, stability and budget; see `tuning.campaign.figures`."""
+    """What a case must keep to count, beside the plant's limits, stability and the budget."""
 
     displacement_m: Positive | None = None
     attenuation: float | None = Field(default=None, lt=1.0)
@@ -119,18 +119,26 @@ class CampaignSpec(Frozen):
         if self.archive is not None:
             extra = [key for key in ("excitation", "schedule", "scatter", "budgets_w") if getattr(self, key)]
             if extra:
-                raise ValueError(f"archive: recordings are replayed as they are; leave out {', '.join(extra)}")
+                raise ValueError(
+                    f"archive: recordings are replayed as they are; leave out {', '.join(extra)}"
+                )
             return self
         if not self.excitation:
-            raise ValueError("excitation: missing; add at least one [[excitation]], or [archive] with recordings")
+            raise ValueError(
+                "excitation: missing; add at least one [[excitation]], or [archive] with recordings"
+            )
         if self.schedule is None:
-            raise ValueError('schedule: missing; add [schedule] with kind = "thesis", "retuned" or "from_file"')
+            raise ValueError(
+                'schedule: missing; add [schedule] with kind = "thesis", "retuned" or "from_file"'
+            )
         if isinstance(self.schedule, Retuned) and not self.budgets_w:
             raise ValueError("budgets_w [W]: missing; the tuner needs a budget to retune within")
         names = [s.parameter for s in self.scatter]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"scatter: {', '.join(twice)} is there twice; give each parameter one distribution")
+            raise ValueError(
+                f"scatter: {', '.join(twice)} is there twice; give each parameter one distribution"
+            )
         noisy = [name for name in names if name.endswith(".noise_density")]
         if noisy and not self.sensor_noise:
             raise ValueError(f"scatter: {noisy[0]} does nothing without noise; add sensor_noise = true")

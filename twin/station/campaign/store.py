@@ -41,12 +41,16 @@ class Store:
                         "or delete it"
                     )
             elif folder.exists() and any(folder.iterdir()):
-                raise InputError(f"{folder}: is there already and holds no campaign; choose another with --out")
+                raise InputError(
+                    f"{folder}: is there already and holds no campaign; choose another with --out"
+                )
             (folder / PARTS).mkdir(parents=True, exist_ok=True)
             text = json.dumps({"name": name, "fingerprint": fingerprint}, indent=2)
             _replace(mark, lambda path: path.write_text(text + "\n", encoding="utf-8"))
         except (OSError, ValueError, AttributeError) as error:
-            raise InputError(f"{folder}: cannot be used for results ({error}); choose another with --out") from error
+            raise InputError(
+                f"{folder}: cannot be used for results ({error}); choose another with --out"
+            ) from error
 
     def done(self) -> dict[int, int]:
         """Numbers of the jobs that are kept, with their numbers of rows; parts that cannot be read are left out."""
