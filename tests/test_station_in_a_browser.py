@@ -33,6 +33,7 @@ def test_budget_moved_reviewed_sent_obeyed_audited_and_taken_back(
     chromium = requires_debian("chromium")
     from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=45_000)
     complaints: list[str] = []
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=str(chromium), headless=True, args=FLAGS)
@@ -49,17 +50,19 @@ def test_budget_moved_reviewed_sent_obeyed_audited_and_taken_back(
             page.click("#on")
         expect(page.locator("#s-control dd")).to_have_text("on", timeout=30_000)
         expect(page.locator("#s-model dd")).to_have_text("consistent", timeout=60_000)
-        page.wait_for_function("document.body.dataset.redraws > 0")
+        page.wait_for_selector("body[data-redraws]")
 
         def proposed() -> list[float | None]:
             script = "document.getElementById('chart-motion').data.find(t => t.name === 'proposed').y"
             return list(page.evaluate(script))
 
-        before, drawn = proposed(), page.evaluate("Number(document.body.dataset.redraws)")
+        before = proposed()
         page.focus("#budget")
         while number(page.inner_text("#budget-out")) > 0.3:
             page.keyboard.press("ArrowLeft")
-        page.wait_for_function(f"document.body.dataset.redraws > {drawn}")
+        end = time.monotonic() + 20.0
+        while (after := proposed()) == before and time.monotonic() < end:
+            page.wait_for_timeout(200)
         page.wait_for_timeout(1500)
         after = proposed()
         assert before != after
@@ -102,7 +105,7 @@ def test_page_is_usable_by_keyboard_and_on_a_tablet(
         browser = play.chromium.launch(executable_path=str(chromium), headless=True, args=FLAGS)
         page = browser.new_page(viewport={"width": 820, "height": 1180})
         page.goto(running.url)
-        page.wait_for_function("document.body.dataset.redraws > 0", timeout=60_000)
+        page.wait_for_selector("body[data-redraws]", timeout=60_000)
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
         unnamed = page.evaluate(
             "[...document.querySelectorAll('input,select')].filter(e => !e.labels.length).map(e => e.id)"
@@ -140,6 +143,7 @@ def test_ctrl_c_ends_with_a_summary_a_whole_recording_and_control_off(running: S
 
 def test_a_station_that_returns_finds_the_rig_safe_and_a_rig_that_returns_is_followed(running: Station) -> None:
     running.start_live("--no-web", "--automatic", "--seconds", "60")
+    time.sleep(2.0)
     running.rig.kill()
     running.rig.wait()
     time.sleep(1.5)

@@ -302,7 +302,8 @@ class RigGateway:
                     "start again for a new recording"
                 )
         counts = self.counts
-        away_s = max(0.0, time.monotonic() - self._last_arrival_s)
+        heard = self._last_arrival_s  # 0 before the first block: then nothing is missing
+        away_s = max(0.0, time.monotonic() - heard) if heard else 0.0
         following = run.arrivals.next_sample or 0
         fresh = _Run(
             hello, run.channels, run.factors, offset=following + round(away_s * hello.sample_rate_hz)

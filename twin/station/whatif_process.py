@@ -8,6 +8,7 @@ import contextlib
 import math
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 from collections import deque
@@ -78,8 +79,9 @@ class WhatIfProcess:
     """
 
     def __init__(self) -> None:
-        self._sending, self._reading = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
         self._number = 0
+        self._waiting: dict[int, queue.SimpleQueue[tuple[str, Any]]] = {}
         self._process: SpawnProcess | None = None
         self._connection: Connection[Any, Any] | None = None
         self._start()
@@ -99,9 +101,10 @@ class WhatIfProcess:
         RunError
             If the process died or does not answer.
         """
-        with self._sending:
+        with self._lock:
             self._number += 1
             number, connection = self._number, self._connection
+            parts = self._waiting[number] = queue.SimpleQueue()
             try:
                 if connection is None:
                     raise RunError("what-if has ended")
@@ -109,19 +112,12 @@ class WhatIfProcess:
             except OSError as error:
                 self._start()
                 raise RunError("what-if had to be started anew; ask again") from error
-        with self._reading:
+        try:
             while True:
                 try:
-                    if not connection.poll(ANSWER_TIMEOUT_S):
-                        raise RunError("what-if does not answer")
-                    answering, what, part = connection.recv()
-                except (EOFError, OSError) as error:
-                    with self._sending:
-                        if self._connection is connection:
-                            self._start()
-                    raise RunError("what-if had to be started anew; ask again") from error
-                if answering != number:
-                    continue  # what is left of a question whose asker has gone
+                    what, part = parts.get(timeout=ANSWER_TIMEOUT_S)
+                except queue.Empty as error:
+                    raise RunError("what-if does not answer") from error
                 match what:
                     case "end":
                         return
@@ -130,6 +126,8 @@ class WhatIfProcess:
                     case "failed":
                         raise RunError(part)
                 yield part
+        finally:
+            self._waiting.pop(number, None)
 
     def last(self, asked: Asked) -> Any:
         """Return the last part of the answer; None if there is none."""
@@ -150,6 +148,22 @@ class WhatIfProcess:
         process.start()
         theirs.close()
         self._process, self._connection = process, ours
+        threading.Thread(target=self._receive, args=(ours,), name="what-if", daemon=True).start()
+
+    def _receive(self, connection: "Connection[Any, Any]") -> None:
+        """Hand the parts of answers to whoever asked, until the process is gone."""
+        try:
+            while True:
+                number, what, part = connection.recv()
+                parts = self._waiting.get(number)
+                if parts is not None:  # else its asker has gone
+                    parts.put((what, part))
+        except (EOFError, OSError, TypeError):
+            with self._lock:
+                if self._connection is connection:  # it died, and was not ended
+                    self._start()
+            for parts in list(self._waiting.values()):
+                parts.put(("failed", "what-if had to be started anew; ask again"))
 
 
 def _serve(connection: "Connection[Any, Any]") -> None:

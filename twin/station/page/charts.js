@@ -28,7 +28,7 @@ function layout(x, y, log) {
 const um = (v) => (v === null || v === undefined ? null : Math.max(1e6 * v, 0.01));
 let now = null;
 
-export function drawCurves(c) {
+export function drawCurves(c, everything) {
   const f = c.points.map((p) => p.frequency_hz);
   const of = (which, key) => c.points.map((p) => p[which]?.[key] ?? null);
   const motion = [
@@ -53,7 +53,7 @@ export function drawCurves(c) {
   }
   Plotly.react("chart-motion", motion, { ...layout("excitation [Hz]", "table motion |x1|, peak [µm]", true), datarevision: performance.now() }, OPTIONS);
   Plotly.react("chart-power", power, layout("excitation [Hz]", "coil power [W]"), OPTIONS);
-  Plotly.react("chart-damping", damping, layout("excitation [Hz]", "c2 [Ns/m]"), OPTIONS);
+  if (everything) Plotly.react("chart-damping", damping, layout("excitation [Hz]", "c2 [Ns/m]"), OPTIONS);
 }
 
 export function showNow(state) {

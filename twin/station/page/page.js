@@ -68,7 +68,7 @@ async function redraw() {
 
 async function follow_curves(answer, began) {
   const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
-  let text = "", first = null, drawn = 0;
+  let text = "", first = null, drawn = 0, whole = false;
   for (;;) {
     const { done, value } = await reader.read();
     if (done) break;
@@ -83,11 +83,16 @@ async function follow_curves(answer, began) {
       else if (line.reason) put("whatif-state", line.reason);
     }
     if (!curves) continue;
-    drawCurves(curves);
-    first ??= performance.now() - began;
-    drawn += 1;
+    const due = performance.now();
+    if (first === null || due - drawn > 120) { // drawing costs as much as an answer
+      drawCurves(curves, first === null);
+      first ??= performance.now() - began;
+      drawn = performance.now();
+      whole = false;
+    } else whole = true;
     if (wanted) { await reader.cancel(); break; } // a newer setting: the rest of this one is of no use
   }
+  if (whole) drawCurves(curves, false);
   const without = curves ? curves.points.filter((p) => p.reason).length : 0;
   put("whatif-state", without ? `No gains at ${without} of ${curves.points.length} frequencies: ${curves.points.find((p) => p.reason).reason}` : "");
   if (first !== null) {
