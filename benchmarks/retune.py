@@ -13,7 +13,7 @@ from tuning.retune import Retuner, TuningGoal
 from twin.plant.config import DampingTable
 from twin.station.demo import DRIVE_V, demo_programme
 
-WANTED_P99_MS = 30.0
+WANTED_P99_MS, WANTED_QP_MS = 30.0, 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def run_retune(setting: Setting) -> Report:
             programs.append(1e3 * (time.perf_counter() - began))
 
     rng = np.random.default_rng(4)
-    taken, feasible = [], 0
+    taken, worked, feasible = [], [], 0
     GainProgram._step = timed  # type: ignore[assignment, method-assign]
     try:
         for k in range(setting.proposals + 3):
@@ -54,19 +54,23 @@ def run_retune(setting: Setting) -> Report:
             frequency = float(rng.choice(programme.schedule.frequency_hz))
             table = DampingTable(frequency_hz=(40.0, 60.0), ns_m=(c2, c2))
             now = plant.with_damping(absorber.name, table)
-            began = time.perf_counter()
+            began, worked_before = time.perf_counter(), time.process_time()
             proposal = retuner.propose(0, now, 0.1, frequency, DRIVE_V, programme.schedule)
             if k >= 3:
                 taken.append(1e3 * (time.perf_counter() - began))
+                worked.append(1e3 * (time.process_time() - worked_before))
                 feasible += proposal.feasible
             else:
                 programs.clear()
     finally:
         GainProgram._step = solve  # type: ignore[method-assign]
     low, median, high, late = np.percentile(taken, [25.0, 50.0, 75.0, 99.0])
+    middle, latest = np.percentile(worked, [50.0, 99.0])
     figures = {
         "median_ms": float(median),
         "p99_ms": float(late),
+        "cpu_median_ms": float(middle),
+        "cpu_p99_ms": float(latest),
         "qp_ms": float(np.median(programs)) if programs else 0.0,
         "proposals": setting.proposals,
         "feasible": feasible,
@@ -75,6 +79,14 @@ def run_retune(setting: Setting) -> Report:
     rows = [
         Row("retuning one point, median", float(median), "ms", spread=spread),
         Row("retuning one point, 99th percentile", float(late), "ms", WANTED_P99_MS, "less"),
-        Row("  a quadratic program of 20 rows through OSQP, median", figures["qp_ms"], "ms"),
+        Row("  of processor time, median", float(middle), "ms"),
+        Row("  of processor time, 99th percentile", float(latest), "ms"),
+        Row(
+            "  a quadratic program of 20 rows through OSQP, median",
+            figures["qp_ms"],
+            "ms",
+            WANTED_QP_MS,
+            "less",
+        ),
     ]
     return Report({"retune": figures}, rows)

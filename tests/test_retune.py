@@ -25,8 +25,8 @@ from tuned import (
 from tuning.loop import RigModel, loop_facts, margin_grid
 from tuning.retune import NoGainsError, Retuner, TuningGoal, predict
 from tuning.rule import paired_low_pass_hz, scheduling_rule
-from tuning.types import BudgetKind, OperatingPoint
-from twin.control.schedule import Gains
+from tuning.types import BudgetKind, OperatingPoint, Proposal
+from twin.control.schedule import Gains, GainSchedule
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
@@ -114,7 +114,7 @@ def test_more_power_buys_a_quieter_table_and_a_larger_margin_a_louder_one() -> N
     volts=st.floats(0.5, 6.0),
     margin=st.sampled_from([0.1, 0.15, 0.3]),
 )
-def test_no_proposal_on_any_rig_like_plant_is_unstable_or_over_its_budget(
+def test_no_proposal_on_any_rig_like_plant_is_unstable_over_its_budget_or_worse_than_what_it_replaces(
     table: float, absorber: float, spring: float, damping: float, std: float, hz: float, budget: float,
     volts: float, margin: float,
 ) -> None:  # fmt: skip
@@ -134,8 +134,75 @@ def test_no_proposal_on_any_rig_like_plant_is_unstable_or_over_its_budget(
     proposal = Retuner(plant, FACTS, goal).propose(0, plant, std, hz, volts, TEST_3)
     assert proposal.feasible == bool(proposal.points)
     assert proposal.points or proposal.reason
-    for _, point in proposal.points:
+    for row, point in proposal.points:
         verify(plant, point, goal, volts, std)
+        in_use = TEST_3.at(GRID_HZ[row])
+        if keeps_all(plant, in_use, GRID_HZ[row], goal, volts, std):
+            before = predict(RigModel(plant, FACTS, point.frequency_hz), in_use, point.frequency_hz, volts)
+            assert point.predicted_displacement_m <= before.displacement_m * (1.0 + 1e-9)
+    # And what was proposed is in use next: the same question again must not end in anything worse.
+    table = with_points(TEST_3, proposal)
+    again = Retuner(plant, FACTS, goal).propose(0, plant, std, hz, volts, table)
+    assert len(again.points) >= len(proposal.points)
+    after = dict(again.points)
+    for row, point in proposal.points:
+        assert after[row].predicted_displacement_m <= point.predicted_displacement_m * (1.0 + 1e-9)
+
+
+def keeps_all(plant: Plant, gains: Gains, hz: float, goal: TuningGoal, volts: float, std: float) -> bool:
+    """Whether gains keep, with room to spare, all that a proposal must: only then is motion alone compared."""
+    damping = plant.body[1].damping_at(hz)
+    grid = margin_grid(RATE_HZ, natural_frequencies_hz(plant), 2000)
+    limits = plant.limits
+    for c in (damping, max(0.0, damping - 2.0 * std), damping + 2.0 * std):
+        model = RigModel(plant, FACTS, hz, c)
+        if not model.decay_rate_1_s(gains) < -1.01 * goal.slowest_decay_1_s:
+            return False
+        L = model.loop_terms(grid, gains.low_pass_hz, gains.high_pass_hz) @ np.array(gains.as_tuple()[:3])
+        if np.min(np.abs(1.0 + L)) < 1.01 * goal.modulus_margin:
+            return False
+        for f in (hz,) if c != damping else (hz - goal.drift_hz, hz, hz + goal.drift_hz):
+            p = predict(model, gains, f, volts)
+            power_w = min(goal.budget_w, limits.get("vcm_power_w", math.inf))
+            shares = (
+                p.powers.joule_mean_w / power_w,
+                p.current_peak_a / limits["vcm_current_a"],
+                p.stroke_m / limits["stroke_m"],
+                p.voltage_peak_v / limits.get("vcm_voltage_v", math.inf),
+            )
+            if max(shares) > 0.99:
+                return False
+    return True
+
+
+def with_points(table: GainSchedule, proposal: Proposal) -> GainSchedule:
+    """A table with a proposal's gains in its rows."""
+    columns = {k: list(getattr(table, k)) for k in ("alpha_kg", "beta_ns_m", "gamma_n_m")}
+    for row, point in proposal.points:
+        for name, column in columns.items():
+            column[row] = getattr(point.gains, name)
+    return table.model_copy(update={name: tuple(column) for name, column in columns.items()})
+
+
+def test_gains_in_use_that_are_quieter_than_the_searchs_are_never_replaced() -> None:
+    goal = TuningGoal(reach_hz=0.1)
+    first = Retuner(RIG, FACTS, goal).propose(0, RIG, 0.1, 50.0, VOLTS, TEST_3)
+    ((_, point),) = first.points
+    assert not point.kept
+    ((_, again),) = (
+        Retuner(RIG, FACTS, goal).propose(0, RIG, 0.1, 50.0, VOLTS, with_points(TEST_3, first)).points
+    )
+    assert again.kept
+    assert again.gains == point.gains
+    assert again.predicted_displacement_m == pytest.approx(point.predicted_displacement_m, rel=1e-9)
+
+
+def test_search_aims_a_hair_above_what_is_verified_with_wide_cutoffs() -> None:
+    wide = Gains(0.0, 0.0, 0.0, 1000.0, 2.5)
+    for facts in (FACTS, loop_facts(RATE_HZ, 50e-6)):
+        for delay_s in (0.0, 200e-6):
+            point = Retuner(RIG, facts, TuningGoal(delay_margin_s=delay_s)).point(RIG, 0.1, 46.0, VOLTS, wide)
+            assert point.modulus_margin >= 0.15
 
 
 def test_same_question_twice_is_answered_with_identical_numbers() -> None:

@@ -40,8 +40,7 @@ def solve_step(hessian: Array, gradient: Array, rows: Array, upper: Array) -> St
     rows, upper
         (n, 3), (n,).
     """
-    root = np.linalg.cholesky(hessian)
-    into = np.ascontiguousarray(np.linalg.inv(root).T)  # s = into z
+    into = inverse_root(hessian)  # s = into z
     pull = into.T @ gradient
     reach = max(float(np.linalg.norm(pull)), 1e-300)
     leaning, size, bound = np.empty((len(upper), VARIABLES)), np.empty(len(upper)), np.empty(len(upper))
@@ -53,6 +52,33 @@ def solve_step(hessian: Array, gradient: Array, rows: Array, upper: Array) -> St
         return None
     chosen = binding[:count].copy()
     return Step(into @ z * reach, chosen, multipliers[:count] * reach / size[chosen])
+
+
+@kernel
+def inverse_root(hessian: Array) -> Array:
+    """The (3, 3) upper triangular U with ``U' H U = 1``, by Cholesky.
+
+    Parameters
+    ----------
+    hessian
+        (3, 3) positive definite.
+    """
+    root, into = np.zeros((3, 3)), np.zeros((3, 3))
+    for j in range(3):
+        for i in range(j, 3):
+            left = hessian[i, j]
+            for k in range(j):
+                left -= root[i, k] * root[j, k]
+            # Rounding may leave a pivot of nothing where the damping is tiny beside the largest curvature.
+            root[i, j] = np.sqrt(max(left, 1e-300)) if i == j else left / root[j, j]
+    for j in range(3):
+        into[j, j] = 1.0 / root[j, j]
+        for i in range(j + 1, 3):
+            total = 0.0
+            for k in range(j, i):
+                total += root[i, k] * into[j, k]
+            into[j, i] = -total / root[i, i]
+    return into
 
 
 @kernel

@@ -193,6 +193,10 @@ class Retuner:
                     point = self._point(situation, in_use)
                     self._solved[row] = _Solved(question, point)
             except NoGainsError as error:
+                stays = self._in_use_without_better(situation, in_use)
+                if stays is not None:
+                    points.append((row, stays))
+                    continue
                 reason = f"{frequency:g} Hz: {error}"
                 refusals.append((row, Refusal(frequency, error.binding, reason, error.least_budget_w)))
                 continue
@@ -336,6 +340,14 @@ class Retuner:
             return point
         best = LimitResult(0j, point.limit_displacement_m, ())
         return self._describe(situation, in_use, best, verdict, point.active_limits, kept=True)
+
+    def _in_use_without_better(self, situation: Situation, in_use: Gains) -> OperatingPoint | None:
+        """Gains in use that keep everything, where the search found none that do; None if they do not."""
+        verdict = verify(situation, in_use, self._demands)
+        if verdict.trouble:
+            return None
+        best = physical_limit(situation.paths, self._limits)
+        return self._describe(situation, in_use, best, verdict, best.active, kept=True)
 
     def _without_a_limit(self, situation: Situation, reason: str) -> NoGainsError:
         """The limits exclude each other: say which, and what power would do."""
