@@ -141,9 +141,10 @@ def test_answers_come_back_to_the_bit(run: tuple[Path, list[Trace]]) -> None:
     assert answers.KnownAnswers({"x": "{}"}).get("x") is None
 
 
-def test_seeking_back_and_forth_changes_no_bit(run: tuple[Path, list[Trace]]) -> None:
+@pytest.mark.parametrize("recompute", [False, True])
+def test_seeking_back_and_forth_changes_no_bit(run: tuple[Path, list[Trace]], recompute: bool) -> None:
     path, made = run
-    player = Player(open_any(path, ReplayOptions()), checkpoint_s=0.5)
+    player = Player(open_any(path, ReplayOptions(recompute=recompute)), checkpoint_s=0.5)
     for time_s, blocks in ((2.0, 20), (0.3, 3), (3.1, 31), (1.75, 17), (0.0, 0), (99.0, 40)):
         player.seek(time_s)
         assert player.time_s == pytest.approx(0.1 * blocks)

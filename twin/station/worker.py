@@ -10,6 +10,7 @@ ways differ, and it is recorded: a replay takes every answer at the block at whi
 """
 
 import contextlib
+import copy
 import json
 import multiprocessing
 import os
@@ -162,8 +163,10 @@ class TunerHere:
         self._order = (plant, facts, goal)
         self._adviser = self._fresh()
         self._when, self._known = when, known
+        self._worked: dict[str, Answer] = {}
         self._begin = self._chain = chain_begin(plant, facts, goal)
-        self._passed_over: list[Question] = []
+        self._heard: list[Question] = []
+        self._behind = 0
         self._open: Question | None = None
         self._blocks = 0
         self._asked = 0
@@ -198,24 +201,30 @@ class TunerHere:
         self._open, asked = None, self._chain
         answer = None
         if not trouble:
-            answer = self._known.get(asked)
-            if answer is not None:
-                self._passed_over.append(question)
-            else:
+            answer = self._known.get(asked) or self._worked.get(asked)
+            if answer is None:
                 answer, trouble = self._work_out(question)
+            self._heard.append(question)
         if answer is None:
             self._adviser = self._fresh()  # as a worker that is started anew it remembers nothing
-            self._chain = self._begin
-            self._passed_over.clear()
+            self._chain, self._heard, self._behind = self._begin, [], 0
+        else:
+            self._worked[asked] = answer
         return Arrival(question.number, answer, trouble, asked)
 
     def _work_out(self, question: Question) -> tuple[Answer | None, str]:
-        # An adviser remembers what it was asked: what was passed over is made up for first.
-        for before in self._passed_over:
+        # An adviser remembers what it was asked: what it did not hear of is made up for first.
+        for before in self._heard[self._behind :]:
             _answer(self._adviser, before)
-        self._passed_over.clear()
+        self._behind = len(self._heard) + 1
         self.worked_out += 1
         return _answer(self._adviser, question)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "TunerHere":
+        """A tuner that goes on from here by itself; its adviser hears of what was asked only if it is needed."""
+        twin = copy.copy(self)
+        twin._adviser, twin._behind, twin._heard = self._fresh(), 0, list(self._heard)
+        return twin
 
     def close(self) -> None:
         """Nothing to end."""
