@@ -55,6 +55,21 @@ def solve_step(hessian: Array, gradient: Array, rows: Array, upper: Array) -> St
 
 
 @kernel
+def _solve(gram: Array, right: Array, count: int) -> None:
+    """Solve the first ``count`` equations of a positive definite system in place, by elimination."""
+    for k in range(count):
+        for i in range(k + 1, count):
+            share = gram[i, k] / gram[k, k]
+            for j in range(k, count):
+                gram[i, j] -= share * gram[k, j]
+            right[i] -= share * right[k]
+    for k in range(count - 1, -1, -1):
+        for j in range(k + 1, count):
+            right[k] -= gram[k, j] * right[j]
+        right[k] /= gram[k, k]
+
+
+@kernel
 def inverse_root(hessian: Array) -> Array:
     """The (3, 3) upper triangular U with ``U' H U = 1``, by Cholesky.
 
@@ -146,8 +161,7 @@ def project(rows: Array, upper: Array, z: Array, binding: NDArray[np.int64], mul
                 r[j] = 0.0
                 for v in range(3):
                     r[j] += rows[binding[j], v] * rows[new, v]
-            if count > 0:
-                r[:count] = np.linalg.solve(gram[:count, :count].copy(), r[:count].copy())
+            _solve(gram, r, count)
             free = 0.0
             for v in range(3):
                 d[v] = rows[new, v]
