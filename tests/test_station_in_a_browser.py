@@ -56,6 +56,8 @@ def test_budget_moved_reviewed_sent_obeyed_audited_and_taken_back(
             script = "document.getElementById('chart-motion').data.find(t => t.name === 'proposed').y"
             return list(page.evaluate(script))
 
+        page.wait_for_selector("body[data-complete-ms]")
+        page.wait_for_timeout(1500)
         before = proposed()
         page.focus("#budget")
         while number(page.inner_text("#budget-out")) > 0.3:
@@ -142,6 +144,8 @@ def test_ctrl_c_ends_with_a_summary_a_whole_recording_and_control_off(running: S
 
 
 def test_a_station_that_returns_finds_the_rig_safe_and_a_rig_that_returns_is_followed(running: Station) -> None:
+    if running.live.poll() is None:
+        running.end_live()
     running.start_live("--no-web", "--automatic", "--seconds", "60")
     time.sleep(2.0)
     running.rig.kill()
