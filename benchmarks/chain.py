@@ -175,7 +175,9 @@ def _watch(session: Session) -> dict[str, float]:
     return total
 
 
-def baseline_factors(programme: Programme, block: Block, session: Session, samples: int) -> tuple[float, float]:
+def baseline_factors(
+    programme: Programme, block: Block, session: Session, samples: int
+) -> tuple[float, float]:
     """Real-time factors of plant and observer: the program's own, then `dlsim` and filterpy sample by sample."""
     names = tuple(c.name for c in session.channels)
     observer = full_observer(programme, session)

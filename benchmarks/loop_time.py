@@ -58,7 +58,9 @@ def loop_block_times(blocks: int = 200, tuner: Tuner | None = None) -> dict[str,
                 times = [_advance(session, block) for block in some]
                 if k:  # the first turn warms up
                     taken[name] += times
-            time.sleep(0.3)  # the open question is answered: the next turn's first session finds a quiet machine
+            time.sleep(
+                0.3
+            )  # the open question is answered: the next turn's first session finds a quiet machine
     figures = {}
     for name, times in taken.items():
         figures[f"loop_block_ms_{name}"] = float(np.median(times))

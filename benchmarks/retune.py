@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.loop_time import loop_block_times
 from benchmarks.report import Report, Row
 from tuning.gains import GainProgram
 from tuning.loop import LoopFacts
@@ -21,9 +22,10 @@ class Setting:
     """How many proposals are timed."""
 
     proposals: int = 300
+    blocks: int = 200
 
 
-SMALL = Setting(proposals=5)
+SMALL = Setting(proposals=5, blocks=30)
 
 
 def run_retune(setting: Setting) -> Report:
@@ -74,7 +76,7 @@ def run_retune(setting: Setting) -> Report:
         "qp_ms": float(np.median(programs)) if programs else 0.0,
         "proposals": setting.proposals,
         "feasible": feasible,
-    }
+    } | loop_block_times(setting.blocks)
     spread = float(0.5 * (high - low) / median)
     rows = [
         Row("retuning one point, median", float(median), "ms", spread=spread),
@@ -88,5 +90,9 @@ def run_retune(setting: Setting) -> Report:
             WANTED_QP_MS,
             "less",
         ),
+    ]
+    rows += [
+        Row("a block in the loop, tuner idle, median", figures["loop_block_ms_idle"], "ms"),
+        Row("a block in the loop, tuner at work beside it, median", figures["loop_block_ms_retuning"], "ms"),
     ]
     return Report({"retune": figures}, rows)

@@ -28,13 +28,13 @@ class Statistics(NamedTuple):
 
     Attributes
     ----------
-    count
+    samples
         (3, p) number of independent samples that would be as certain; 0 where nothing was measured.
     value
         (3, p); NaN where there is none.
     """
 
-    count: Array
+    samples: Array
     value: Array
 
 
@@ -52,7 +52,7 @@ class FadingStatistics:
 
     def add(self, s: Statistics, fade: float) -> None:
         """Take one block in, after the older ones' weight has faded by a factor."""
-        fade_in(s.count, s.value, fade, CAPS, self._sums)
+        fade_in(s.samples, s.value, fade, CAPS, self._sums)
 
     def statistics(self) -> Statistics:
         """Weighted means, and the number of equally weighted samples that would be as certain."""

@@ -227,12 +227,12 @@ class HealthMonitor:
 
     def _health(self, estimate: StateEstimate, now: Statistics, cause: _Cause) -> Health:
         bias = whiteness = math.nan
-        if now.count[NIS].any():
+        if now.samples[NIS].any():
             named = [k for k, name in enumerate(estimate.sensors) if name == cause.channel]
-            if named and now.count[NIS, named[0]] > 0.0:
+            if named and now.samples[NIS, named[0]] > 0.0:
                 worst = named[0]
             else:
-                worst = int(np.argmax(np.nan_to_num(np.abs(now.value[BIAS])) * np.sqrt(now.count[BIAS])))
+                worst = int(np.argmax(np.nan_to_num(np.abs(now.value[BIAS])) * np.sqrt(now.samples[BIAS])))
             bias, whiteness = float(now.value[BIAS, worst]), float(now.value[LAG1, worst])
         return Health(
             verdict=_VERDICTS[cause.severity],
@@ -240,7 +240,7 @@ class HealthMonitor:
             test=cause.test,
             reason=cause.reason,
             nis=estimate.nis,
-            nis_band=nis_band(float(now.count[NIS].sum()), BAND_LEVEL),
+            nis_band=nis_band(float(now.samples[NIS].sum()), BAND_LEVEL),
             bias=bias,
             whiteness=whiteness,
             since_sample=self._since,
@@ -249,7 +249,7 @@ class HealthMonitor:
     def _severity(self, s: Statistics) -> int:
         """0 to 3 by the worst statistic of any sensor; NaN, of a sensor that said nothing, is beyond no bound."""
         settings, severity = self.settings, 0
-        for counts, values in zip(s.count.T.tolist(), s.value.T.tolist(), strict=True):
+        for counts, values in zip(s.samples.T.tolist(), s.value.T.tolist(), strict=True):
             low, high = nis_band(counts[NIS], VERDICT_LEVEL)
             nis, off, colour = values[NIS], abs(values[BIAS]), abs(values[LAG1])
             chance = bias_band(counts[BIAS], VERDICT_LEVEL)
@@ -270,9 +270,9 @@ class HealthMonitor:
         """Find the test and the channel that says most, and put it in words."""
         nis = np.where(np.isfinite(s.value[NIS]), s.value[NIS], 1.0)
         mean, lag1 = np.nan_to_num(s.value[BIAS]), np.nan_to_num(s.value[LAG1])
-        bands = np.array([nis_band(n, VERDICT_LEVEL) for n in s.count[NIS].tolist()])
-        low, high = np.nan_to_num(bands[:, 0]), np.where(s.count[NIS] > 0.0, bands[:, 1], np.inf)
-        chance = np.array([bias_band(n, VERDICT_LEVEL) for n in s.count[BIAS].tolist()])
+        bands = np.array([nis_band(n, VERDICT_LEVEL) for n in s.samples[NIS].tolist()])
+        low, high = np.nan_to_num(bands[:, 0]), np.where(s.samples[NIS] > 0.0, bands[:, 1], np.inf)
+        chance = np.array([bias_band(n, VERDICT_LEVEL) for n in s.samples[BIAS].tolist()])
         excess = np.maximum(nis - 1.0 - mean**2, 0.0)
         biased = (np.abs(mean) - self.settings.bias) / chance
         over = nis > self.settings.nis[1] * high

@@ -32,7 +32,9 @@ from twin.station.session import Session, SessionSettings  # noqa: E402
 def main() -> None:
     """Make what was asked for."""
     parser = argparse.ArgumentParser(prog="python -m recordings", description=__doc__)
-    parser.add_argument("folder", nargs="*", help="names of folders here with a config.toml; all unless given")
+    parser.add_argument(
+        "folder", nargs="*", help="names of folders here with a config.toml; all unless given"
+    )
     parser.add_argument("--expected", action="store_true", help="keep the recording, write its results anew")
     options = parser.parse_args()
     for name in options.folder or sorted(p.parent.name for p in FOLDER.glob(f"*/{CONFIG}")):

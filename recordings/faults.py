@@ -38,7 +38,9 @@ class Fault:
         self._column = 0
         if self._kind != "lost":
             if config["channel"] not in channels:
-                raise InputError(f"fault.channel '{config['channel']}' is not recorded; use one of {channels}")
+                raise InputError(
+                    f"fault.channel '{config['channel']}' is not recorded; use one of {channels}"
+                )
             self._column = channels.index(config["channel"])
 
     def apply(self, values: Array, first_sample: int) -> Array:

@@ -113,7 +113,7 @@ def test_a_second_recording_of_the_same_name_does_not_cost_the_first(tmp_path: P
 
 @contextmanager
 def demo_in_mid_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], psutil.Process]]:
-    """A demo in real time, three seconds into its recording, and the process of its rig."""
+    """A demo in real time, more than six blocks into its recording, and the process of its rig."""
     command = [
         sys.executable,
         "-m",
@@ -131,7 +131,8 @@ def demo_in_mid_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], psuti
     ) as process:  # fmt: skip
         rig = wait_for_rig(process.pid)
         wait_until((folder / "run.rrd").exists, 60.0)
-        time.sleep(3.0)
+        block = 5_000 * 7 * 4  # bytes
+        wait_until(lambda: (folder / "run.rrd").stat().st_size > 10 * block, 60.0)
         yield process, rig
 
 
@@ -271,7 +272,7 @@ def test_malformed_plant_is_explained(tmp_path: Path, content: str, complaint: s
     ("words", "complaint"),
     [
         (("replay", "nothing.rrd"), "nothing.rrd: no such recording"),
-        (("replay", "notes.txt"), "known: .rrd, .npz"),
+        (("replay", "notes.txt"), "says nothing about its plant"),
         (("replay", "whole.npz"), "add --plant"),
         (("replay", "whole.npz", "--plant", "bem"), "no preset of that name"),
         (("replay", "whole.npz", "--plant", "beam"), "sample rate"),

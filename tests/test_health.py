@@ -125,10 +125,10 @@ def test_fading_memory_is_as_certain_as_it_says() -> None:
         count = np.full((3, 2000), 20.0)
         memory.add(Statistics(count, np.vstack([np.mean(e**2, 0), np.mean(e, 0), np.zeros(2000)])), 0.9)
     s = memory.statistics()
-    assert np.allclose(s.count, 20.0 * 1.9 / 0.1, rtol=2e-2)  # n (1 + f) / (1 - f) in the long run
-    ends = np.abs(s.value[1]) > bias_band(float(s.count[1, 0]), 0.05)
+    assert np.allclose(s.samples, 20.0 * 1.9 / 0.1, rtol=2e-2)  # n (1 + f) / (1 - f) in the long run
+    ends = np.abs(s.value[1]) > bias_band(float(s.samples[1, 0]), 0.05)
     inside(ends, 0.05)
-    assert np.std(s.value[0]) == pytest.approx(math.sqrt(2.0 / s.count[0, 0]), rel=0.1)
+    assert np.std(s.value[0]) == pytest.approx(math.sqrt(2.0 / s.samples[0, 0]), rel=0.1)
 
 
 # --- the verdict ------------------------------------------------------------------------------------------
@@ -251,7 +251,7 @@ def test_whatever_the_innovations_the_verdict_is_one_and_says_why(numbers: Array
             health = monitor.advance(block, estimate, (), observer, 50.0)
             assert (health.verdict == "consistent") == (not health.reason) == (not health.channel)
             memory = statistics_of(estimate)
-            assert np.isfinite(memory.count).all()
+            assert np.isfinite(memory.samples).all()
     healthy = monitor.advance(block, estimate_of(white(10, 40)[:, :4]), (), observer, 50.0)
     assert math.isfinite(healthy.bias)
 

@@ -390,7 +390,9 @@ def test_emergency_off_gets_through_while_every_thread_of_the_page_is_busy(
         raise desk_module.RefusedError("it took too long")
 
     monkeypatch.setattr(Desk, "propose", stuck)
-    busy = [threading.Thread(target=post, args=(page, "/api/propose"), kwargs={"changes": {}}) for _ in range(60)]
+    busy = [
+        threading.Thread(target=post, args=(page, "/api/propose"), kwargs={"changes": {}}) for _ in range(60)
+    ]
     for thread in busy:
         thread.start()
     time.sleep(0.5)
@@ -411,7 +413,10 @@ def test_branch_begins_where_the_measured_trace_goes_on(page: OperatorPage, made
     answer = post(page, "/api/branch", changes={}, seconds=0.3).json
     made.run(3)
     measured = ask(
-        page, "GET", f"/api/trace?from_sample={answer['from_sample']}&seconds=0.3", Cookie=cookie(page).split(";")[0]
+        page,
+        "GET",
+        f"/api/trace?from_sample={answer['from_sample']}&seconds=0.3",
+        Cookie=cookie(page).split(";")[0],
     ).json["displacement_m"]
     used = next(t for t in answer["traces"] if t["name"] == "in use")
     assert len(measured) == len(used["displacement_m"]) == 300

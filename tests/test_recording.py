@@ -231,7 +231,11 @@ def test_whenever_a_recorder_is_killed_all_but_the_block_in_its_hands_comes_back
         recording = open_recording(path, hold_bytes=HELD_BYTES)
         read = list(recording.blocks())
         assert not recording.finished
-        assert taken - 1 <= len(read) <= taken + 1, (k, n, taken)  # + 1: written, and killed before it could say so
+        assert taken - 1 <= len(read) <= taken + 1, (
+            k,
+            n,
+            taken,
+        )  # + 1: written, and killed before it could say so
         for i, block in enumerate(read):
             assert_same_block(a_block(i * n, n), block)
     assert began > KILLS // 2
@@ -355,7 +359,9 @@ def test_recording_ends_whole_before_the_disk_is_full(
     assert recording.n_blocks == 5
 
 
-def test_a_disk_without_room_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_room_is_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("twin.rig.recording.free_bytes", lambda _: 5_000_000)
     with pytest.raises(RunError, match="nothing was recorded"):
         a_recorder(tmp_path / "run.rrd", storage=Storage())

@@ -129,7 +129,9 @@ SAYS = {
 }
 
 
-def test_what_went_wrong_is_said_and_what_was_ordered_is_repeated(folder: Path, results: dict[str, Any]) -> None:
+def test_what_went_wrong_is_said_and_what_was_ordered_is_repeated(
+    folder: Path, results: dict[str, Any]
+) -> None:
     if folder.name in SAYS:
         assert any(SAYS[folder.name] in text for text in results["events"])
     if folder.name == "whatif_budget_change":

@@ -44,7 +44,9 @@ class Trace:
 
 
 def trace(frame: Frame) -> Trace:
-    proposal = "" if frame.arrival is None or frame.arrival.answer is None else answers.as_json(frame.arrival.answer)
+    proposal = (
+        "" if frame.arrival is None or frame.arrival.answer is None else answers.as_json(frame.arrival.answer)
+    )
     return Trace(
         frame.block.end_sample,
         frame.estimate.mean.tobytes(),

@@ -172,7 +172,7 @@ def test_the_log_tells_events_decisions_and_answers(shown) -> None:
     _, rows = shown
     _, texts = rows["/log", "TextLog:text"]
     said = " | ".join(c[0] for c in texts)
-    for part in ("control on", "proposal accepted (operator)", "command 1 applied", "samples missing"):
+    for part in ("control on", "order accepted (operator)", "command 1 applied", "samples missing"):
         assert part in said
     _, levels = rows["/log", "TextLog:level"]
     assert "WARN" in {c[0] for c in levels}

@@ -143,7 +143,9 @@ def test_ctrl_c_ends_with_a_summary_a_whole_recording_and_control_off(running: S
     assert running.rig.poll() is None
 
 
-def test_a_station_that_returns_finds_the_rig_safe_and_a_rig_that_returns_is_followed(running: Station) -> None:
+def test_a_station_that_returns_finds_the_rig_safe_and_a_rig_that_returns_is_followed(
+    running: Station,
+) -> None:
     if running.live.poll() is None:
         running.end_live()
     running.start_live("--no-web", "--automatic", "--seconds", "60")

@@ -203,7 +203,9 @@ def open_recording(path: Path, *, hold_bytes: int = 0, alone: bool = False) -> R
             continue  # another run's, left beside this one
         found.append(part)
         numbers.append(k)
-    missing = tuple(k for k in range(1, numbers[-1]) if k not in numbers) if len(found) > 1 or number > 1 else ()
+    missing = (
+        tuple(k for k in range(1, numbers[-1]) if k not in numbers) if len(found) > 1 or number > 1 else ()
+    )
     return _joined(found, missing)
 
 

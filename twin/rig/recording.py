@@ -231,7 +231,9 @@ class Recorder:
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except RuntimeError as error:
-            raise RunError(f"{self._file}: the disk takes no more data ({error}); record elsewhere") from error
+            raise RunError(
+                f"{self._file}: the disk takes no more data ({error}); record elsewhere"
+            ) from error
         self._pipe.drain(_FLUSH_TIMEOUT_S)
 
     def close(self) -> None:

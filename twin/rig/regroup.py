@@ -33,7 +33,9 @@ class Mark:
 
 def mark_of(block: Block) -> Mark:
     """What a block says besides its samples."""
-    return Mark(block.first_sample, block.n_samples, block.config_id, block.control_on, block.commands_applied)
+    return Mark(
+        block.first_sample, block.n_samples, block.config_id, block.control_on, block.commands_applied
+    )
 
 
 def in_pieces(blocks: Iterable[Block], n_samples: int) -> Iterator[Block]:
@@ -84,7 +86,10 @@ def restored(pieces: Iterable[Block], marks: Iterable[Mark]) -> Iterator[Block]:
             at = held.first_sample + stop
         whole = _joined(parts)
         yield replace(
-            whole, config_id=mark.config_id, control_on=mark.control_on, commands_applied=mark.commands_applied
+            whole,
+            config_id=mark.config_id,
+            control_on=mark.control_on,
+            commands_applied=mark.commands_applied,
         )
 
 

@@ -50,7 +50,9 @@ class Storage:
                 raise InputError(f"a size or time of {value:g} cannot be kept; give one above zero")
         rotates = self.rotate_bytes is not None or self.rotate_s is not None
         if self.drop_oldest and not rotates:
-            raise InputError("old files can only be dropped if there are several: say when to start a new one")
+            raise InputError(
+                "old files can only be dropped if there are several: say when to start a new one"
+            )
         if self.rotate_bytes and self.budget_bytes and self.budget_bytes < 2 * self.rotate_bytes:
             raise InputError(
                 f"a budget of {as_size(self.budget_bytes)} does not hold two files of "

@@ -108,7 +108,9 @@ DiskBudgetOption = Annotated[
 ]
 DropOldestOption = Annotated[
     bool,
-    typer.Option("--drop-oldest", help="Remove the oldest files when there is no room; else recording stops."),
+    typer.Option(
+        "--drop-oldest", help="Remove the oldest files when there is no room; else recording stops."
+    ),
 ]
 
 
@@ -253,7 +255,10 @@ def replay(
         bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
     ] = False,
     from_s: Annotated[
-        float, typer.Option("--from", min=0.0, metavar="S", help="Show from here on; what was before is played unseen.")
+        float,
+        typer.Option(
+            "--from", min=0.0, metavar="S", help="Show from here on; what was before is played unseen."
+        ),
     ] = 0.0,
     to_s: Annotated[float | None, typer.Option("--to", min=0.0, metavar="S", help="End here.")] = None,
     speed: Annotated[
@@ -262,12 +267,15 @@ def replay(
     recompute: Annotated[
         bool,
         typer.Option(
-            "--recompute", help="Work the tuner's answers out again, also where question and program are the same."
+            "--recompute",
+            help="Work the tuner's answers out again, also where question and program are the same.",
         ),
     ] = False,
     block_ms: Annotated[
         float | None,
-        typer.Option(min=1e-3, metavar="MS", help="Read in pieces of this size; results are the same to the bit."),
+        typer.Option(
+            min=1e-3, metavar="MS", help="Read in pieces of this size; results are the same to the bit."
+        ),
     ] = None,
     rotate: RotateOption = None,
     disk_budget: DiskBudgetOption = None,

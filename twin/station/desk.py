@@ -181,7 +181,11 @@ class Desk:
 
     def propose(self, changes: Changes) -> Reviewed:
         """Work out a proposal for the whole table and keep it for review."""
-        if changes.damping_ns_m is not None or changes.damping_scale is not None or changes.excitation is not None:
+        if (
+            changes.damping_ns_m is not None
+            or changes.damping_scale is not None
+            or changes.excitation is not None
+        ):
             raise RefusedError(
                 "excitation and c2 are as the rig has them in a proposal; take their overrides off first"
             )
@@ -317,7 +321,9 @@ class Desk:
             if ours is not None and theirs is not None:
                 moved = abs(ours.damping_at(f) - theirs.damping_at(f))
                 if moved > limit:
-                    raise RefusedError(f"stale: the damping at {f:g} Hz has moved by {moved:.2f} Ns/m; propose again")
+                    raise RefusedError(
+                        f"stale: the damping at {f:g} Hz has moved by {moved:.2f} Ns/m; propose again"
+                    )
 
 
 def parse_changes(given: dict[str, Any]) -> Changes:

@@ -104,7 +104,9 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
         session.warm_up()
         desk: Desk | None = None
         if options.web:
-            desk = Desk(session, gateway, lambda: _wire_state(gateway), lambda: outputs.frames_unseen, outputs.url)
+            desk = Desk(
+                session, gateway, lambda: _wire_state(gateway), lambda: outputs.frames_unseen, outputs.url
+            )
             page = stack.enter_context(OperatorPage(desk, options.bind, options.port))
             say(f"operator page: {page.url}")
         loop = Loop(session, outputs, gateway, desk, _Remarks(gateway, say))
@@ -143,7 +145,9 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
         return result
 
 
-def _go_on(loop: Loop, gateway: RigGateway, options: LiveOptions, on_silence: Callable[[float], None]) -> None:
+def _go_on(
+    loop: Loop, gateway: RigGateway, options: LiveOptions, on_silence: Callable[[float], None]
+) -> None:
     restarts = gateway.restarts
     for block in gateway.blocks(patience_s=math.inf, on_silence=on_silence):
         order = None
@@ -204,7 +208,8 @@ def _in_words(hello: Hello) -> str:
     of = f" '{hello.plant}'" if hello.plant else ""
     return (
         f"rig{of}, {len(hello.channels)} channels at {hello.sample_rate_hz / 1e3:g} kS/s in blocks of "
-        f"{hello.block_samples}, " + ("with a controller" if hello.schedule is not None else "without a controller")
+        f"{hello.block_samples}, "
+        + ("with a controller" if hello.schedule is not None else "without a controller")
     )
 
 

@@ -108,9 +108,7 @@ class Opened:
         loop, tuner = self.settings.loop, None
         if loop is not None and self.timing is not None:
             tuner = TunerHere(self.plant, loop, self.settings.goal, self.timing, self.known)
-        return Session(
-            self.plant, self.channels, self.sample_rate_hz, self.settings, self.commands, tuner
-        )
+        return Session(self.plant, self.channels, self.sample_rate_hz, self.settings, self.commands, tuner)
 
 
 def open_any(path: Path, options: ReplayOptions) -> Opened:
@@ -177,7 +175,9 @@ def _condition(recording: Recording) -> list[str]:
         remarks.append("its recorder did not finish it: it was killed, or is still recording")
     if recording.missing_parts:
         numbers = ", ".join(map(str, recording.missing_parts))
-        remarks.append(f"files {numbers} of the run are missing: what was learned and decided then is not known here")
+        remarks.append(
+            f"files {numbers} of the run are missing: what was learned and decided then is not known here"
+        )
     if len(recording.parts) > 1:
         remarks.append(f"one run in {len(recording.parts)} files, to {recording.parts[-1].name}")
     return remarks
@@ -242,5 +242,3 @@ def _estimate_disturbance(
         f"{rows[0]} to {rows[1]} best, and those rows are not scored"
     )
     return found.plant, rows, remark
-
-

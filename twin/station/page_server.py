@@ -329,7 +329,9 @@ class OperatorPage:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not self._server.started:
             if not self._thread.is_alive() or time.monotonic() > deadline:
-                raise RunError(f"the operator page's server did not start on {shown}:{port}; try another --port")
+                raise RunError(
+                    f"the operator page's server did not start on {shown}:{port}; try another --port"
+                )
             time.sleep(0.02)
 
     def __enter__(self) -> Self:
@@ -383,5 +385,3 @@ def _own_addresses() -> set[str]:
 def _no_tracebacks_of_garbage(record: logging.LogRecord) -> bool:
     """Bytes that are no HTTP are refused by the server already; nobody wants them in the terminal."""
     return "Invalid HTTP request" not in record.getMessage()
-
-

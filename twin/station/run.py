@@ -117,7 +117,5 @@ class Loop:
 def _has_gone_out(ordered: Ordered | None, command: Command) -> bool:
     """Whether a command was sent beside the loop: an emergency stop."""
     return (
-        ordered is not None
-        and ordered.order is not None
-        and ordered.order.command_id == command.command_id
+        ordered is not None and ordered.order is not None and ordered.order.command_id == command.command_id
     )

@@ -369,9 +369,7 @@ class Session:
             return self.plant
         return self.plant.with_damping(absorber.name, self._learner.table())
 
-    def _follow_force(
-        self, estimate: StateEstimate, phasors: Phasors | None
-    ) -> tuple[float, float] | None:
+    def _follow_force(self, estimate: StateEstimate, phasors: Phasors | None) -> tuple[float, float] | None:
         """Amplitude of an exciting force that nothing measures, and its standard deviation [N]; None if all is."""
         unknown = self.observer.unknown_force
         if unknown is None:

@@ -291,5 +291,3 @@ def _steps(base: Base, meant: GainSchedule) -> tuple[GainSchedule, ...]:
                 return (meant,)
         steps.append(meant.with_points(gains))
     return (*steps, meant)
-
-

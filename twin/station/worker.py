@@ -158,7 +158,12 @@ class TunerHere:
     """
 
     def __init__(
-        self, plant: Plant, facts: LoopFacts, goal: TuningGoal, when: When, known: KnownAnswers = NOTHING_KNOWN
+        self,
+        plant: Plant,
+        facts: LoopFacts,
+        goal: TuningGoal,
+        when: When,
+        known: KnownAnswers = NOTHING_KNOWN,
     ) -> None:
         self._order = (plant, facts, goal)
         self._adviser = self._fresh()
