@@ -130,6 +130,7 @@ def page_app(desk: Desk) -> FastAPI:
 
     @app.get("/api/stream")
     async def stream(request: Request) -> Response:
+        """Status as server-sent events, for as long as the browser listens."""
         return StreamingResponse(_states(desk, request), media_type="text/event-stream")
 
     @app.post("/api/whatif")
@@ -172,6 +173,7 @@ def page_app(desk: Desk) -> FastAPI:
     # Not through the thread pool, whose threads what-if may all be using: this must always get through.
     @app.post("/api/off")
     async def off() -> Any:
+        """Switch control off, past the loop and whatever it waits for."""
         return {"command_id": desk.off()}
 
     @app.post("/api/branch")
