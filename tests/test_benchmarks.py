@@ -22,7 +22,9 @@ def numbers(value: Any) -> list[float]:
         return [n for v in value.values() for n in numbers(v)]
     if isinstance(value, list):
         return [n for v in value for n in numbers(v)]
-    return [] if isinstance(value, str) else [float(value)]
+    return (
+        [] if isinstance(value, str) or value is None else [float(value)]
+    )  # None: not measured in this setting
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -74,7 +76,12 @@ def test_chain_reports_every_mode_and_stage(reports: dict[str, Report]) -> None:
 def test_every_timed_proposal_is_feasible(reports: dict[str, Report]) -> None:
     figures = reports["retune"].figures["retune"]
     assert figures["feasible"] == figures["proposals"]
-    assert 0.0 < figures["qp_ms"] < figures["median_ms"] <= figures["p99_ms"]
+    assert 0.0 < figures["median_ms"] <= figures["p99_ms"]
+    assert (
+        figures["qp_ms"] < figures["median_ms"]
+    )  # 0 where so few proposals needed no program for their start
+    assert figures["loop_block_ms_idle"] > 0.0
+    assert figures["loop_block_ms_retuning"] > 0.0
 
 
 @pytest.mark.parametrize(("value", "better", "verdict"), [(2.0, "more", "ok"), (2.0, "less", "short")])
