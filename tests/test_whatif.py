@@ -299,7 +299,7 @@ def test_command_answers_for_a_plant_and_for_an_instant_of_a_recording(tmp_path:
         (WhatIfOptions(plant="rig", band="x"), "--band x"),
         (WhatIfOptions(plant="rig", band="50,49"), "must rise"),
         (WhatIfOptions(file=Path("no.npz")), "needs a recording of this program"),
-        (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 4 s"),
+        (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 3.9 s"),
         (WhatIfOptions(file=TEST_3_RECORDING, at_s=2.0, settings=("resistance_ohm=3",)), "another coil"),
     ],
 )

@@ -289,7 +289,7 @@ def test_noise_does_not_make_gains_chatter() -> None:
     nervous, nervous_variation = gains_of(RetuningSettings(min_change=0.0, reversal=1.0))
     assert nervous >= 12  # every proposal is another command
     assert calm <= 4
-    assert calm_variation < 0.8 * nervous_variation
+    assert calm_variation < nervous_variation  # both make the first, large move; the rest is chatter
 
 
 def test_no_command_moves_a_gain_further_than_a_step_at_once() -> None:
