@@ -23,7 +23,7 @@ from estimators.types import DampingCurve, Phasors, StateEstimate
 from tuning.loop import LoopFacts
 from tuning.retune import TuningGoal
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
-from twin.plant.blocks import Block, Channel
+from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import GROUND, ForceActuator, Plant
 from twin.plant.errors import InputError
 from twin.plant.inputs import DriveReader, InputSource, choose_inputs, driven_model
@@ -211,6 +211,14 @@ class Session:
         twin._check.warm_up(block)
         if twin._learner is not None:
             twin._learner.warm_up()
+        # And a few blocks as they come, through everything: read-only, whole and with a gap.
+        fs, n = twin.observer.sample_rate_hz, 2_000
+        t = np.arange(4 * n)[:, None] / fs
+        wave = 0.1 * np.sin(2.0 * np.pi * self._frequency * t + np.arange(len(self.channels)))
+        wave += 1e-3 * np.sin(1e3 * t * t * fs)  # no two samples alike, as noise has it
+        wave[n, :] = np.nan
+        for k in range(4):
+            twin.advance(make_block(k * n, fs, wave[k * n : (k + 1) * n], self.channels, control_on=False))
         if self.retuning is not None:
             self.retuning.warm_up(self.identified_plant())
 
