@@ -27,6 +27,8 @@ def run_replay(
     say: Callable[[str], None],
     progress: Callable[[int, int], None],
     linger: Callable[[], None] | None = None,
+    watch: Callable[[Session, Frame], None] | None = None,
+    opened: Opened | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through the loop.
 
@@ -40,6 +42,10 @@ def run_replay(
         Takes samples done and samples in all.
     linger
         Called when the run is over and its recording finished, while the views are still served.
+    watch
+        Takes the session and each frame that counts, after everything else has.
+    opened
+        The recording, where it is open already.
 
     Returns
     -------
@@ -51,7 +57,7 @@ def run_replay(
     InputError
         If the recording or the plant cannot be used; the message says why and what to do.
     """
-    opened = open_any(path, options)
+    opened = open_any(path, options) if opened is None else opened
     for remark in opened.remarks:
         say(remark)
     session = opened.session()
@@ -84,6 +90,8 @@ def run_replay(
         for frame in player.play(options.to_s, options.speed):
             repeated.add(frame)
             score.add(frame.block, frame.estimate)
+            if watch is not None:
+                watch(session, frame)
             progress(frame.block.end_sample, opened.n_samples)
         outputs.finish()
         if linger is not None:
