@@ -1,4 +1,4 @@
-"""``python -m benchmarks [CASE ...] [--json FILE|-]``."""
+"""``python -m benchmarks [CASE ...] [--json FILE|-]``, or ``python -m benchmarks soak`` for the long live run."""
 
 import argparse
 import json
@@ -19,14 +19,28 @@ from benchmarks.cases import CASES, run_case  # noqa: E402
 def main() -> None:
     """Run the cases that were asked for; the table goes to stdout, or to stderr where the JSON does."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Speed, side by side.")
-    parser.add_argument("case", nargs="*", choices=[*CASES, []], metavar="CASE", help=", ".join(CASES))
+    parser.add_argument(
+        "case",
+        nargs="*",
+        choices=[*CASES, "soak", []],
+        metavar="CASE",
+        help=", ".join(CASES) + "; or soak, alone",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the figures as JSON; - for stdout")
-    options = parser.parse_args()
+    options, others = parser.parse_known_args()
+    if options.case == ["soak"]:
+        # Not among the cases: it takes as long as it is told, and starts programs of its own.
+        from benchmarks.soak import run_soak, setting_from
+
+        reports = [run_soak(setting_from(others))]
+    else:
+        if others or "soak" in options.case:
+            parser.error(f"cannot be combined: {' '.join([*options.case, *others])}")
+        reports = [run_case(name) for name in options.case or CASES]
     console = Console(file=sys.stderr if options.json == "-" else sys.stdout, width=130)
     figures: dict[str, object] = {}
     table = Table("figure", "value", "spread", "target", "", title="Speed", title_justify="left")
-    for name in options.case or CASES:
-        report = run_case(name)
+    for report in reports:
         figures |= report.figures
         for row in report.rows:
             table.add_row(*row.cells())

@@ -57,10 +57,11 @@ class Station:
                 env=os.environ | {"COLUMNS": "200"},
             )
 
-    def start_rig(self, hz: float = 53.0) -> None:
+    def start_rig(self, hz: float = 53.0, *more: str) -> None:
         self.rig = self._start(
             "rig", "rig", "--keys", self.folder / "rig.key_secret", "--station", self.folder / "station.key",
             "--port", str(self.port), "--pattern", "tone", "--band", f"{hz:g}:{hz + 1:g}",
+            *more,
         )  # fmt: skip
         wait_for(self.folder / "rig.log", "samples on", self.rig)
 

@@ -2,6 +2,8 @@
 
 The rig's only clock is its sample count. At ``speed`` 1 blocks leave at the rate of a real rig; at ``speed`` 0
 they leave as fast as the station's heartbeats allow, which makes a run repeatable whatever else the machine does.
+Without heartbeats the controller goes off after half a second of the rig's samples; where these wait for the station,
+after half a second of this machine's time.
 """
 
 import contextlib
@@ -59,7 +61,7 @@ class RigServer:
     stations
         Public keys that may connect.
     speed
-        1 keeps real time, 0 goes as fast as the station follows.
+        1 keeps real time, 0 goes as fast as the station follows; a rig of its own then keeps real time without one.
     host, samples_port, commands_port
         Where to bind; port 0 takes a free one.
     stands_alone
@@ -107,7 +109,7 @@ class RigServer:
             raise
         self._run_id = secrets.token_hex(8)
         self._station: bytes | None = None
-        self._heard_sample = 0
+        self._heard_sample, self._heard_s = 0, 0.0
         self._started = self._stopped = self._fallen_back = False
         self._station_sample = self._last_command = 0
         self._early: list[Acknowledgement] = []
@@ -150,12 +152,14 @@ class RigServer:
 
     def _stream(self) -> None:
         programme = self.rig.programme
-        begin = time.monotonic()
+        self._last_block_s = time.monotonic()
         sequence = 0
         while not self.rig.finished and not self._stopped:
             if self.speed > 0.0:
                 self._poll(0.0)
                 self._watch_the_station()
+            elif self._stands_alone:
+                self._await_leisurely()
             else:
                 lead = LEAD_BLOCKS * programme.block_samples
                 self._await(
@@ -170,9 +174,7 @@ class RigServer:
             values, control_on, acknowledgements = self.rig.next_block()
             self._fallen_back = self._fallen_back and not self.rig.control_enabled
             if self.speed > 0.0:
-                due = begin + (sequence + 1) * programme.block_s / self.speed
-                while (left := due - time.monotonic()) > 0.0:
-                    self._poll(left)
+                self._await_due(programme.block_s / self.speed)
             header = SamplesHeader(
                 run_id=self._run_id,
                 sequence=sequence,
@@ -191,15 +193,47 @@ class RigServer:
             if self._starter_gone():
                 raise RunError("the starter of this rig is gone")
 
+    def _await_due(self, period_s: float) -> None:
+        """Wait until the block's time has come; what was missed while this process stood still is not made up for."""
+        due = self._last_block_s + period_s
+        if time.monotonic() - due > HEARTBEAT_TIMEOUT_S:
+            due = time.monotonic()
+        while (left := due - time.monotonic()) > 0.0:
+            self._poll(left)
+        self._last_block_s = due
+
+    def _await_leisurely(self) -> None:
+        """Wait for the station as long as there is one, and for nobody longer than in real time."""
+        programme = self.rig.programme
+        lead = LEAD_BLOCKS * programme.block_samples
+        while True:
+            self._poll(0.0)
+            now = time.monotonic()
+            if self._station is None:
+                left = self._last_block_s + programme.block_s - now
+            elif self.rig.next_sample - self._station_sample <= lead:
+                left = 0.0
+            else:
+                left = self._heard_s + HEARTBEAT_TIMEOUT_S - now
+                if left <= 0.0:
+                    self._lose_the_station()
+            if left <= 0.0:
+                self._last_block_s = now
+                return
+            self._poll(left)
+
     def _watch_the_station(self) -> None:
         """Switch control off so early that the coming block ends within the time a station may be silent."""
         programme = self.rig.programme
         silent = self.rig.next_sample + programme.block_samples - self._heard_sample
         if silent > HEARTBEAT_TIMEOUT_S * programme.sample_rate_hz:
-            # Safe gains: none. What the station last ordered may not fit what the rig does by now.
-            if self.rig.control_enabled:
-                self.rig.control_enabled, self._fallen_back = False, True
-            self._station = None if self._stands_alone else self._station
+            self._lose_the_station()
+
+    def _lose_the_station(self) -> None:
+        # Safe gains: none. What the station last ordered may not fit what the rig does by now.
+        if self.rig.control_enabled:
+            self.rig.control_enabled, self._fallen_back = False, True
+        self._station = None if self._stands_alone else self._station
 
     def _say_hello(self) -> None:
         programme = self.rig.programme
@@ -235,9 +269,9 @@ class RigServer:
         if kind not in ("start", "stop", "heartbeat", "command"):
             self._answer(sender, {"type": "refused", "reason": "unknown message"})
             return
-        if self._station is None and kind != "stop":
-            self._station = sender  # whoever speaks first has the controls, until leaving or falling silent
-            self._last_command = 0
+        taken_over = self._station is None and kind != "stop"
+        if taken_over:
+            self._give_controls(sender)
         if sender != self._station:
             if kind == "command":
                 self._answer(sender, _refusal(message.get("command"), "another station has the controls"))
@@ -247,17 +281,27 @@ class RigServer:
         match kind:
             case "start":
                 self._started = True
-                self._heard_sample = self.rig.next_sample
             case "stop":
                 self._leave()
             case "heartbeat" if _whole(message.get("next_sample")):
                 told = min(message["next_sample"], self.rig.next_sample)  # nobody is ahead of the rig
+                if taken_over:
+                    self._station_sample = (
+                        told - 1
+                    )  # it may have been listening, and have blocks to catch up with
                 if told > self._station_sample:  # one that repeats itself has stopped working
                     self._station_sample, self._heard_sample = told, self.rig.next_sample
+                    self._heard_s = time.monotonic()
             case "command":
                 self._command(sender, message.get("command"))
             case _:
                 self._answer(sender, {"type": "refused", "reason": "a heartbeat needs a whole next_sample"})
+
+    def _give_controls(self, sender: bytes) -> None:
+        """Whoever speaks first has the controls, until leaving or falling silent; what was before it is not its own."""
+        self._station, self._last_command = sender, 0
+        self._station_sample = self._heard_sample = self.rig.next_sample
+        self._heard_s = time.monotonic()
 
     def _leave(self) -> None:
         if not self._stands_alone:

@@ -468,7 +468,10 @@ def rig(
         float,
         typer.Option(min=0.01, help="High-pass the rig starts with, in Hz; the low-pass is paired with it."),
     ] = 2.5,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="1 keeps real time.")] = 1.0,
+    speed: Annotated[
+        float,
+        typer.Option(min=0.0, max=100.0, help="1 keeps real time, 0 goes as fast as the station follows."),
+    ] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the sensor noise.")] = 0,
 ) -> None:
     """Run the simulated rig as a program of its own, until Ctrl-C or the end of its sweep.
