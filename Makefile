@@ -33,7 +33,7 @@ demo: $(VENV)/.run $(VENV)/.project ## Set everything up and run the demonstrati
 	$(BIN)/atmd demo $(ARGS)
 
 test: $(VENV)/.dev $(VENV)/.project ## Set everything up and run the tests (ARGS="-k observer")
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: $(VENV)/.dev ## Style and formatting
 	$(BIN)/ruff check .

@@ -496,6 +496,28 @@ def test_what_fitted_on_a_full_disk_can_be_read(tmp_path: Path) -> None:
         subprocess.run(["umount", str(tmp_path)], check=True)
 
 
+def test_a_disk_that_is_slow_to_confirm_costs_no_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The end of a run falls into the disk's confirmation of what came before it.
+    confirm = os.fsync
+
+    def slowly(handle: int) -> None:
+        confirm(handle)
+        time.sleep(0.3)
+
+    path, recorder = tmp_path / "run.rrd", a_recorder(tmp_path / "run.rrd")
+    recorder.write_block(a_block(0))
+    monkeypatch.setattr(os, "fsync", slowly)
+    recorder.flush()
+    time.sleep(0.15)  # the confirmation has begun and is not over
+    recorder.write_block(a_block(1))
+    recorder.close()
+    read = open_recording(path)
+    assert read.finished
+    assert read.n_blocks == 2
+
+
 def test_closing_does_not_wait_for_a_forked_child(tmp_path: Path) -> None:
     recorder = a_recorder(tmp_path / "run.rrd")
     recorder.write_block(a_block(0))

@@ -134,6 +134,7 @@ class FilePipe:
         # A process forked meanwhile may hold the pipe open, so an end of file need not come: hence `_closing`.
         synced, dirty = time.monotonic(), False
         while True:
+            closing = self._closing  # before looking: what the writer wrote until then is then still to be seen
             due = max(0.0, synced + SYNC_S - time.monotonic()) if dirty else _POLL_S
             ready, _, _ = select.select([self._outlet], [], [], due)
             since = time.monotonic() - synced
@@ -141,7 +142,7 @@ class FilePipe:
                 self._sync()
                 synced, dirty = time.monotonic(), False
             if not ready:
-                if self._closing:
+                if closing:
                     break
                 continue
             with self._busy:
