@@ -16,7 +16,7 @@ from twin.plant.errors import InputError
 from twin.plant.files import load_plant, parse_toml
 from twin.rig.arrayref import ArrayRef, parse_array_ref
 from twin.rig.foreign import ForeignRecording, open_foreign
-from twin.rig.units import to_si, units_for
+from twin.rig.units import is_common, sensitivity_to_si, to_si, units_for
 
 RATE_HZ = 100.0
 
@@ -216,20 +216,65 @@ def test_units_become_si(unit: str, si: str, factor: float) -> None:
     assert units_for(si)[0] == si
 
 
-@pytest.mark.parametrize("unit", ["furlong", "MM", "", "m/s3", "G"])
-def test_unknown_units_are_not_guessed_at(unit: str) -> None:
-    assert to_si(unit) is None
+@pytest.mark.parametrize(
+    ("unit", "expected", "si", "factor"),
+    [
+        ("g", "kg", "kg", 1e-3), ("mg", "kg", "kg", 1e-6), ("g", "m/s²", "m/s²", 9.80665), ("g_n", "", "m/s²", 9.80665),
+        ("in", "m", "m", 0.0254), ("inches/s", "", "m/s", 0.0254), ("mm/s/s", "", "m/s²", 1e-3),
+        ("lbf", "", "N", 4.4482216152605), ("rpm", "", "rad/s", np.pi / 30.0), ("rpm", "Hz", "Hz", 1.0 / 60.0),
+        ("50 g", "m/s²", "m/s²", 490.3325), ("furlong", "m", "m", 201.168), ("kg", "", "kg", 1.0),
+        ("kg*m/s^2", "", "N", 1.0), ("kHz", "Hz", "Hz", 1e3), ("deg", "", "rad", np.pi / 180.0),
+    ],
+)  # fmt: skip
+def test_other_units_and_what_g_is_go_by_the_dimension_expected(
+    unit: str, expected: str, si: str, factor: float
+) -> None:
+    assert to_si(unit, expected) == (si, pytest.approx(factor, rel=1e-5))
 
 
 @pytest.mark.parametrize(
-    ("unit", "why"), [("kg", "unit 'kg' is not known"), ("mV", "unit 'mV' is V, the channel is m")]
+    "unit", ["MM", "", "m/s3", "G", "tip", "dB", "degC", "m**9**9", "9**9**9", "a" * 99, "0 g", "1e999 g", "g pk", "1"]
+)
+def test_what_is_no_unit_of_a_channel_is_not_made_into_one(unit: str) -> None:
+    known = to_si(unit)
+    assert known is None or not units_for(known[0])[1:]
+
+
+@pytest.mark.parametrize(
+    ("unit", "sensitivity", "expected", "factor"),
+    [
+        ("mV", "100 mV/g", "m/s²", 0.0980665), ("V", "50 mV/(mm/s)", "m/s", 0.02), ("V", "22.5 mV/N", "N", 1e3 / 22.5),
+        ("V", "10 pC/g", "m/s²", None), ("V", "100 mV/g", "N", None), ("V", "100", "N", None),
+    ],
+)  # fmt: skip
+def test_volts_become_what_the_sensor_measures_by_its_sensitivity(
+    unit: str, sensitivity: str, expected: str, factor: float | None
+) -> None:
+    found = sensitivity_to_si(unit, sensitivity, expected)
+    assert found == (None if factor is None else pytest.approx(factor))
+
+
+@pytest.mark.parametrize("word", ["in", "a", "d", "u", "t", "min", "bar", "hand", "pin", "point", "x"])
+def test_words_of_a_description_are_not_taken_for_units(word: str) -> None:
+    assert not is_common(word)
+    assert is_common("m/s^2")
+    assert is_common("µm")
+
+
+@pytest.mark.parametrize(
+    ("unit", "why"), [
+        ("smoot2x", "unit 'smoot2x' is not known"), ("kg", "unit 'kg' is kg, the channel is m"),
+        ("mV", "unit 'mV' is V, the channel is m"),
+        ("dB", "unit 'dB' is logarithmic or has an offset: there is no factor to SI"),
+        ("degC", "unit 'degC' is logarithmic or has an offset: there is no factor to SI"),
+    ],
 )
 def test_unit_that_does_not_fit_is_refused_with_those_that_do(save: Save, unit: str, why: str) -> None:
     path = save(t=t(), y=t(), piezo=t())
     with pytest.raises(InputError) as error:
         open_foreign(path, plant(), channels={"tip": f"y:{unit}"})
     assert said(error) == (
-        f"{path}: channel 'tip' <- y: {why}; give --channel tip=y:UNIT with one of m, nm, um, mm"
+        f"{path}: channel 'tip' <- y: {why}; give --channel tip=y:UNIT with one of m, nm, um, mm, cm"
     )
 
 

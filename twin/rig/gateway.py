@@ -19,7 +19,7 @@ from twin.plant.linear import Array
 from twin.rig.arrivals import ArrivalCounts, Arrivals
 from twin.rig.drift import ClockDrift
 from twin.rig.messages import VERSION, Hello, SamplesHeader
-from twin.rig.units import to_si, units_for
+from twin.rig.units import COMMON, to_si, units_for
 from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_client
 
 CONNECT_TIMEOUT_S = 60.0
@@ -357,13 +357,14 @@ def _in_si_units(hello: Hello, plant: Plant) -> tuple[tuple[Channel, ...], Array
     expected = {s.name: s.unit for s in plant.sensor} | {a.name: a.input_unit for a in plant.actuator}
     channels, factors = [], np.ones(len(hello.channels))
     for k, sent in enumerate(hello.channels):
-        wanted, found = expected.get(sent.name), to_si(sent.unit)
+        wanted = expected.get(sent.name)
+        found = to_si(sent.unit, wanted or "")
         if wanted is not None and (found is None or found[0] != wanted):
             raise RunError(
                 f"the rig sends channel '{sent.name}' in '{sent.unit}'; plant '{plant.name}' has it in {wanted}: "
                 f"have the rig say one of {', '.join(units_for(wanted))}"
             )
-        unit, factors[k] = found if found is not None else (sent.unit, 1.0)
+        unit, factors[k] = found if found is not None and found[0] in COMMON else (sent.unit, 1.0)
         channels.append(Channel(sent.name, unit))
     if len({c.name for c in channels}) < len(channels):
         raise RunError("the rig sends two channels of the same name")

@@ -8,7 +8,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.arrayref import ArrayRef, parse_array_ref
 from twin.rig.sidecar import NOT_RECORDED, Sidecar
-from twin.rig.units import to_si, units_for
+from twin.rig.units import to_si, units_for, why_not
 
 TIME_NAMES = ("t", "time")
 BY_PLANT = "the plant's recorded_as"
@@ -165,7 +165,7 @@ def _guess(
 
 
 def _candidates(si_unit: str, free: Sequence[str], stated: Mapping[str, str]) -> list[str]:
-    return [a for a in free if a in stated and (to_si(stated[a]) or ("",))[0] == si_unit]
+    return [a for a in free if a in stated and (to_si(stated[a], si_unit) or ("",))[0] == si_unit]
 
 
 def _explain_missing(
@@ -209,15 +209,14 @@ def _with_unit(
     unit = stated if ref.unit is None or (stated and decided == BY_PLANT) else ref.unit
     if unit is None:
         return ChannelMapping(name, ref, si_unit, si_unit, 1.0, f"{decided}; no unit stated, taken as SI")
-    known = to_si(unit)
+    known = to_si(unit, si_unit)
     if known is None or known[0] != si_unit:
-        why = "is not known" if known is None else f"is {known[0]}, the channel is {si_unit}"
         raise InputError(
-            f"{path}: channel '{name}' <- {ref}: unit '{unit}' {why}; "
+            f"{path}: channel '{name}' <- {ref}: unit '{unit}' {why_not(unit, si_unit)}; "
             f"give --channel {name}={ref}:UNIT with one of {', '.join(units_for(si_unit))}"
         )
     if ref.unit is None or unit != ref.unit:
         decided += f"; unit from {beside.units_from}"
-    elif stated and to_si(stated) != known:
+    elif stated and to_si(stated, si_unit) != known:
         decided += f"; {beside.units_from} says {stated}"
     return ChannelMapping(name, ref, unit, si_unit, known[1], decided)

@@ -25,7 +25,7 @@ from twin.plant.config import Frozen, Positive
 from twin.plant.errors import InputError
 from twin.plant.files import read_toml
 from twin.rig.arrayref import ArrayRef, parse_array_ref
-from twin.rig.units import to_si
+from twin.rig.units import is_common
 
 NOT_RECORDED = "none"
 
@@ -183,4 +183,4 @@ def _leading_unit(text: object) -> str | None:
     if not isinstance(text, str) or not text.split():
         return None
     word = text.split()[0].rstrip(",;:.")
-    return word if to_si(word) is not None else None
+    return word if is_common(word) else None

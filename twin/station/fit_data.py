@@ -16,7 +16,7 @@ from twin.rig.archives.detect import open_archive
 from twin.rig.arrayref import ArrayRef, parse_array_ref
 from twin.rig.sidecar import Sidecar, find_sidecar
 from twin.rig.timebase import Stamps, time_base
-from twin.rig.units import to_si
+from twin.rig.units import is_common, to_si
 
 TIMES = ("t", "time", "zeit", "timestamp", "seconds", "temps")
 WORDS = {
@@ -37,11 +37,8 @@ DIMENSIONS = {
     "frequency": ("Hz",), "added mass": ("kg",), "angular frequency": ("rad/s",),
 }  # fmt: skip
 _SETPOINTS = ("reference", "setpoint", "command", "target", "desired", "ref")
-_MORE_UNITS = {
-    "hz": ("Hz", 1.0), "khz": ("Hz", 1e3), "rad/s": ("rad/s", 1.0), "kg": ("kg", 1.0), "gram": ("kg", 1e-3),
-    "db": ("dB", 1.0), "deg": ("deg", 1.0), "rad": ("rad", 1.0), "cm": ("m", 1e-2), "in": ("m", 0.0254),
-    "lbf": ("N", 4.4482216152605), "cm/s": ("m/s", 1e-2), "gn": ("m/s²", 9.80665),
-}  # fmt: skip
+_IN_NAMES = ("hz", "khz", "db", "deg")
+"""Spellings of units in names, beside the common ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +74,7 @@ class Series:
     @property
     def si(self) -> tuple[str, float] | None:
         """SI unit and the factor to it, or None where the unit is not known."""
-        return unit_of(self.unit)
+        return to_si(self.unit)
 
     def real(self) -> Array:
         """(n_samples,) real values; InputError naming the series and row where one is missing."""
@@ -162,7 +159,7 @@ class TestFile:
         """
         name, stamps = next(((k, v) for k, v in self.times.items() if len(v) == n), ("", None))
         unit = self.beside.units.get(name) or (
-            name.rsplit("_", 1)[-1] if to_si(name.rsplit("_", 1)[-1]) else None
+            name.rsplit("_", 1)[-1] if is_common(name.rsplit("_", 1)[-1]) else None
         )
         try:
             base = time_base(
@@ -236,9 +233,8 @@ def open_test(
     return TestFile(path, series, times, own, beside, facts, chosen, sample_rate_hz)
 
 
-def unit_of(unit: str) -> tuple[str, float] | None:
-    """SI unit and factor, with the units of fits that recordings of a rig do not need."""
-    return to_si(unit) or _MORE_UNITS.get(unit.strip().lower()) if unit else None
+def _is_unit(word: str) -> bool:
+    return is_common(word) or word.strip().lower() in _IN_NAMES
 
 
 def _series(
@@ -306,12 +302,12 @@ def _unit_in(name: str, text: str) -> str:
     parts = name.lower().split("_")
     for size in (2, 1):
         tail = "/".join(parts[-size:])
-        if len(parts) > size and (unit_of(tail) or (size == 2 and unit_of(tail.replace("/", "/", 1)))):
+        if len(parts) > size and _is_unit(tail):
             return tail
     # A single letter in a sentence is no unit unless it stands first or last.
     words = [w.strip(",;:()") for w in text.split()]
     for k, word in enumerate(words):
-        if word and unit_of(word) and (len(word) > 1 or k in (0, len(words) - 1)):
+        if word and _is_unit(word) and (len(word) > 1 or k in (0, len(words) - 1)):
             return word
     return ""
 

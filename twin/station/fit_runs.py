@@ -18,8 +18,9 @@ from estimators.fits.transmissibility import fit_transmissibility
 from estimators.fits.types import Estimate
 from twin.plant.errors import InputError
 from twin.plant.linear import Array
+from twin.rig.units import to_si
 from twin.station import fit_plots
-from twin.station.fit_data import Series, TestFile, unit_of
+from twin.station.fit_data import Series, TestFile
 from twin.station.fit_plots import Draw
 
 Band = tuple[float, float] | None
@@ -209,7 +210,7 @@ def run_damper(file: TestFile) -> Result:
     factor = 1.0
     if in_si:
         units = ("N", "m", "m/s")
-        recorded = unit_of((moved or speeds)[0].unit)
+        recorded = to_si((moved or speeds)[0].unit)
         factor = (recorded[1] if recorded else 1.0) / (forces[0].si or ("", 1.0))[1]
     else:
         units = (force_unit, length, f"{length}/s")
@@ -271,10 +272,7 @@ def _si(file: TestFile, s: Series, si_unit: str, assumed: str) -> Array:
     if not s.unit:
         file.notes.append(f"{s.name}: no unit stated, taken as {assumed}")
         return values
-    known = unit_of(s.unit)
-    # A mass in g is in gram, which for accelerations is the unit of gravity.
-    if si_unit == "kg" and s.unit.strip() in ("g", "mg"):
-        known = ("kg", 1e-3 if s.unit.strip() == "g" else 1e-6)
+    known = to_si(s.unit, si_unit)
     if known is None or known[0] != si_unit:
         raise file.error(f"{s.name}: unit '{s.unit}' is none for {si_unit}; give another with --channel")
     return np.asarray(values * known[1])
@@ -424,7 +422,7 @@ def _frequencies(file: TestFile) -> tuple[Array, str]:
     turned = [] if found else file.pick("angular frequency", real, needed=False)
     if found or turned:
         s = (found or turned)[0]
-        known = unit_of(s.unit) if s.unit else None
+        known = to_si(s.unit) if s.unit else None
         factor = known[1] if known else 1.0
         if turned or (known is not None and known[0] == "rad/s"):
             factor = factor / TAU

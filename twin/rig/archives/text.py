@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
 from twin.rig.archives.base import Archive
-from twin.rig.units import to_si
+from twin.rig.units import is_common
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|")
@@ -156,7 +156,7 @@ class TextArchive(Archive):
         if not rows:
             return tuple(f"column{k + 1}" for k in range(width)), units
         below: list[str] = []
-        if len(rows) > 1 and all(to_si(c.strip("[]() ")) or c.strip("[]() -") == "" for c in rows[-1]):
+        if len(rows) > 1 and all(is_common(c.strip("[]() ")) or c.strip("[]() -") == "" for c in rows[-1]):
             below = [cell.strip("[]() ") for cell in rows[-1]]
             rows = rows[:-1]
         names = []
