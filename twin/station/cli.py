@@ -158,7 +158,7 @@ def demo(
         bool, typer.Option("--headless", help="Open no window; draw a picture at the end.")
     ] = False,
     web: Annotated[
-        bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
+        bool, typer.Option("--web", help="Serve the operator page to a browser on this machine.")
     ] = False,
     save: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="Recording; runs/demo.rrd unless given.")
@@ -252,8 +252,10 @@ def replay(
     save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record the replay.")] = None,
     view: Annotated[bool, typer.Option("--view", help="Open Rerun's viewer.")] = False,
     web: Annotated[
-        bool, typer.Option("--web", help="Serve Rerun's viewer to a browser on this machine.")
+        bool, typer.Option("--web", help="Serve the operator page, read-only, to play, pause, step and jump.")
     ] = False,
+    bind: Annotated[str, typer.Option(metavar="HOST", help="Address the page is served on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 0,
     from_s: Annotated[
         float,
         typer.Option(
@@ -262,8 +264,13 @@ def replay(
     ] = 0.0,
     to_s: Annotated[float | None, typer.Option("--to", min=0.0, metavar="S", help="End here.")] = None,
     speed: Annotated[
-        float, typer.Option(min=0.0, help="1 keeps the time of the data, 0 goes as fast as it can.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=100.0,
+            help="1 keeps the time of the data, 0 goes as fast as it can; 1 with --web, else 0, unless given.",
+        ),
+    ] = None,
     recompute: Annotated[
         bool,
         typer.Option(
@@ -287,14 +294,16 @@ def replay(
     Reports how well the observer predicts each sensor one step ahead, as rms(error)/std(signal) on rows that the
     plant's parameters were not fitted on, with the known input and without; for rigs with a voice coil also
     attenuation (against the model's passive motion), powers, and whether the decisions of the run are repeated.
-    To go on from an instant with other gains or parameters: atmd whatif FILE --at S --set KEY=VALUE.
+    To go on from an instant with other gains or parameters: atmd whatif FILE --at S --set KEY=VALUE. With --web the
+    operator's page shows the run as it was, plays, pauses, steps and jumps, and answers what-if from the instant at
+    hand; it stays until Ctrl-C, or without a terminal until nobody looks at it any more.
     JSON keys: nrmse, nrmse_without_input, sensors, blocks, samples, masked_samples, realtime_factor,
     decisions_repeated, answers_recomputed (of the tuner; the others were recorded for the very same questions by the
     very same program), and those of the demo.
     """
     from twin.rig.storage import storage
     from twin.station.outputs import has_display
-    from twin.station.replay import ReplayOptions, run_replay
+    from twin.station.replay import ReplayEnd, ReplayOptions, run_replay
 
     _must_be_rrd(save)
     must_be_writable(json_to)
@@ -317,10 +326,22 @@ def replay(
         piece_s=None if block_ms is None else 1e-3 * block_ms,
         from_s=from_s,
         to_s=to_s,
-        speed=speed,
+        speed=(1.0 if web else 0.0) if speed is None else speed,
+        bind=bind,
+        port=port,
     )
-    with progress_bar("replay") as progress:
-        result = run_replay(file, options, say, progress, _wait_for_browser if web else None)
+
+    def end(_signal: int, _frame: object) -> NoReturn:
+        signal.signal(signal.SIGINT, _interrupt)  # a second one ends what the first did not
+        raise ReplayEnd
+
+    if web:
+        signal.signal(signal.SIGINT, end)
+    try:
+        with progress_bar("replay") as progress:
+            result = run_replay(file, options, say, progress, sys.stdin.isatty)
+    except ReplayEnd:
+        raise Interrupted from None
     report(result, _replay_table, json_to)
 
 

@@ -155,6 +155,7 @@ def run_demo(
         from twin.station.desk import Desk
         from twin.station.outputs import Outputs
         from twin.station.page_server import OperatorPage
+        from twin.station.panel import wire_state
         from twin.station.retuning import RetuningSettings
         from twin.station.run import Loop
         from twin.station.worker import TunerProcess
@@ -194,7 +195,9 @@ def run_demo(
             gateway = rig.gateway
             desk: Desk | None = None
             if options.web:
-                desk = Desk(session, gateway, unseen=lambda: outputs.frames_unseen, viewer_url=outputs.url)
+                desk = Desk(
+                    session, gateway, lambda: wire_state(gateway), lambda: outputs.frames_unseen, outputs.url
+                )
                 page = stack.enter_context(OperatorPage(desk))
                 say(f"operator page: {page.url}")
             loop = Loop(session, outputs, gateway, desk)
@@ -206,6 +209,8 @@ def run_demo(
             except RunError as failure:
                 error = str(failure)
             outputs.finish()
+            if desk is not None:
+                desk.end()
             gateway.close()
             if options.learned is not None and session.learner is not None and log.blocks:
                 save_learned(options.learned, session.learner, programme.plant)

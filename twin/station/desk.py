@@ -1,5 +1,7 @@
 """The operator's desk: between a page that may do anything at any time and a loop that never waits for it."""
 
+import contextlib
+import math
 import secrets
 import threading
 import time
@@ -17,6 +19,7 @@ from twin.station.frame import Frame
 from twin.station.instant import instant_at
 from twin.station.orders import OFF_ID_STEP, Order
 from twin.station.panel import Panel, WireState
+from twin.station.playback import Playback, Wish
 from twin.station.proposals import REVIEW_S, Reviewed, review_of_standing, review_of_what_if
 from twin.station.run import Link
 from twin.station.session import Session
@@ -26,6 +29,9 @@ ORDERS, REFUSALS, PROPOSALS = 16, 20, 20
 ARMED_S = 15.0
 STALE_S = 5.0
 """An order given by somebody who saw older data than this is not taken."""
+
+LEFT_S = 3.0
+"""A browser that is gone for no longer may be loading the page anew."""
 
 HISTORY_FRAMES, TRACE_BLOCKS = 10, 100
 CURVE_POINTS = 11
@@ -62,6 +68,8 @@ class Desk:
         Tells how many frames the viewer could not take.
     viewer_url
         Of Rerun's viewer, to be shown beside the controls.
+    playback
+        Plays the recording, where this is one; None for a rig.
     """
 
     session: Session
@@ -69,6 +77,7 @@ class Desk:
     wire: Callable[[], WireState] = WireState
     unseen: Callable[[], int] = int
     viewer_url: str = ""
+    playback: Playback | None = None
     panel: Panel = field(init=False)
     what_if: WhatIfProcess | None = field(init=False, default=None)
     _orders: deque[Order] = field(default_factory=lambda: deque(maxlen=ORDERS))
@@ -84,6 +93,9 @@ class Desk:
     _base: Base | None = None
     _curve: DampingCurve | None = None
     refused_in_all: int = 0
+    _over: bool = False
+    _watchers: int = 0
+    _watched_s: float = -math.inf
 
     def __post_init__(self) -> None:
         self.panel = Panel(self.session)
@@ -126,7 +138,40 @@ class Desk:
             )  # fmt: skip
         self._shown_s = time.monotonic()
 
+    def jumped(self, session: Session, time_s: float) -> None:
+        """Go on with another session, whose frames do not follow those shown before."""
+        self.session = self.panel.session = session
+        self._frames, self._curve = (), None
+        self._trace.clear()
+        self.panel.jumped(time_s)
+
+    def end(self) -> None:
+        """Say that the run is over: what was is still shown, and nothing can be sent."""
+        self.link, self._over = None, True
+
     # --- the page's side ---
+
+    @contextlib.contextmanager
+    def watcher(self) -> Iterator[None]:
+        """Somebody looks at the page meanwhile."""
+        with self._lock:
+            self._watchers += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._watchers -= 1
+                self._watched_s = time.monotonic()
+
+    def is_watched(self) -> bool:
+        """Whether somebody looks at the page, or did so a moment ago."""
+        return self._watchers > 0 or time.monotonic() - self._watched_s < LEFT_S
+
+    def play(self, wish: Wish) -> None:
+        """Have the recording played, paused, moved."""
+        if self.playback is None:
+            raise RefusedError("this is a rig and no recording: it cannot be played")
+        self.playback.ask(wish)
 
     @property
     def read_only(self) -> bool:
@@ -146,9 +191,11 @@ class Desk:
         return {
             **self.panel.state,
             "read_only": self.read_only,
+            "over": self._over,
             "silent_s": None if silent is None else round(silent, 2),
             "viewer_url": self.viewer_url,
             "refusals": self.refused_in_all,
+            "player": None if self.playback is None else self.playback.state(),
             "what_if": self.what_if is not None and self._base is not None,
         }
 
@@ -253,7 +300,7 @@ class Desk:
         """Switch control off at once, whatever the loop is doing; returns the command's number."""
         link = self.link
         if link is None:
-            raise RefusedError("this is a recording: nothing can be sent", 403)
+            raise RefusedError(self._nothing_to_send_to, 403)
         with self._lock:
             retuning = self.session.retuning
             following = 1 if retuning is None else retuning.next_command
@@ -290,6 +337,11 @@ class Desk:
     def _sample(self) -> int:
         return int(self.panel.state.get("sample", 0))
 
+    @property
+    def _nothing_to_send_to(self) -> str:
+        what = "the run is over" if self._over else "this is a recording"
+        return f"{what}: nothing can be sent"
+
     def _queue(self, order: Order) -> None:
         if len(self._orders) >= ORDERS:
             raise RefusedError("too many orders are waiting: the loop is busy", 503)
@@ -297,7 +349,7 @@ class Desk:
 
     def _may_send(self, seen_sample: int) -> None:
         if self.link is None:
-            raise RefusedError("this is a recording: nothing can be sent", 403)
+            raise RefusedError(self._nothing_to_send_to, 403)
         if self.session.retuning is None:
             raise RefusedError("the rig runs no controller that could take orders")
         behind_s = (self._sample() - seen_sample) / self.session.observer.sample_rate_hz

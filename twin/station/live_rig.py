@@ -23,7 +23,7 @@ from twin.station.desk import Desk
 from twin.station.orders import Order
 from twin.station.outputs import Outputs
 from twin.station.page_server import OperatorPage
-from twin.station.panel import WireState
+from twin.station.panel import wire_state
 from twin.station.retuning import RetuningSettings
 from twin.station.run import Loop
 from twin.station.session import Session, SessionSettings
@@ -105,10 +105,12 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
         desk: Desk | None = None
         if options.web:
             desk = Desk(
-                session, gateway, lambda: _wire_state(gateway), lambda: outputs.frames_unseen, outputs.url
+                session, gateway, lambda: wire_state(gateway), lambda: outputs.frames_unseen, outputs.url
             )
             page = stack.enter_context(OperatorPage(desk, options.bind, options.port))
             say(f"operator page: {page.url}")
+            if page.warning:
+                say(f"warning: {page.warning}")
         loop = Loop(session, outputs, gateway, desk, _Remarks(gateway, say))
         error, interrupted = "", False
         gateway.start()
@@ -242,20 +244,6 @@ class _Silence:
         if seconds >= SILENT_S > self.seconds:
             self._say("the rig is silent; waiting for it, Ctrl-C ends")
         self.seconds = seconds
-
-
-def _wire_state(gateway: RigGateway) -> WireState:
-    c = gateway.counts
-    return WireState(
-        lost=c.lost,
-        late=c.late,
-        repeated=c.repeated,
-        reordered=c.reordered,
-        malformed=gateway.malformed,
-        restarts=gateway.restarts,
-        drift_ppm=_finite(gateway.drift.ppm),
-        notice=gateway.notice,
-    )
 
 
 def _finite(value: float) -> float | None:

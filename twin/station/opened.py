@@ -48,6 +48,8 @@ class ReplayOptions:
         Part to play [s]; what lies before is taken into account, but not shown.
     speed
         1 keeps the time of the data, 0 does not wait.
+    bind, port
+        Where the page is served, if ``web``; port 0 takes a free one.
     """
 
     plant: str | None = None
@@ -63,6 +65,8 @@ class ReplayOptions:
     from_s: float = 0.0
     to_s: float | None = None
     speed: float = 0.0
+    bind: str = "127.0.0.1"
+    port: int = 0
 
 
 class BlockSource(Protocol):

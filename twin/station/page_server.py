@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import ipaddress
 import json
 import logging
 import math
@@ -27,6 +28,7 @@ from twin.plant.errors import InputError, RunError
 from twin.station.desk import ARMED_S, Desk, RefusedError, parse_changes
 from twin.station.guard import Guard
 from twin.station.panel import finite
+from twin.station.playback import Action, Wish
 from twin.station.whatif_process import BRANCH_STEP
 
 START_TIMEOUT_S = 20.0
@@ -75,6 +77,13 @@ class SendBody(ArmBody):
     """An armed proposal."""
 
     code: Annotated[str, Field(max_length=64)]
+
+
+class PlayerBody(_Body):
+    """What a recording is to do; the value is the instant [s] of a seek, or a speed."""
+
+    action: Action
+    value: float = 0.0
 
 
 def page_app(desk: Desk) -> FastAPI:
@@ -187,6 +196,11 @@ def page_app(desk: Desk) -> FastAPI:
             "traces": [_trace(t) for t in traces or ()],
         }
 
+    @app.post("/api/player")
+    def player(body: PlayerBody) -> Any:
+        desk.play(Wish(body.action, body.value))
+        return {"queued": True}
+
     @app.get("/api/trace")
     def trace(from_sample: int, seconds: float) -> Any:
         if not 0.0 < seconds <= 5.0:
@@ -198,11 +212,12 @@ def page_app(desk: Desk) -> FastAPI:
 
 async def _states(desk: Desk, request: Request) -> AsyncIterator[str]:
     seq = 0
-    while not await request.is_disconnected():
-        log = desk.log_after(seq)
-        seq = log[-1]["seq"] if log else seq
-        yield f"data: {json.dumps({**desk.state(), 'log': log}, allow_nan=False)}\n\n"
-        await asyncio.sleep(STATE_EVERY_S)
+    with desk.watcher():
+        while not await request.is_disconnected():
+            log = desk.log_after(seq)
+            seq = log[-1]["seq"] if log else seq
+            yield f"data: {json.dumps({**desk.state(), 'log': log}, allow_nan=False)}\n\n"
+            await asyncio.sleep(STATE_EVERY_S)
 
 
 def _lines(first: Curves, parts: Iterator[Any], desk: Desk) -> Iterator[str]:
@@ -283,6 +298,8 @@ class OperatorPage:
     ----------
     url
         To be opened, with its token.
+    warning
+        What whoever starts it should know; empty if nothing.
 
     Raises
     ------
@@ -297,6 +314,12 @@ class OperatorPage:
         listener = _listener(bind, port)
         port = int(listener.getsockname()[1])
         names = {"127.0.0.1", "localhost", "[::1]", f"[{bind}]" if ":" in bind else bind}
+        self.warning = ""
+        if not _is_loopback(bind):
+            self.warning = (
+                f"the operator page listens on {bind}: whoever can listen to this network can read its token and "
+                "give orders; keep to the loopback interface (ssh -L) unless the network is the rig's own"
+            )
         if bind in ("0.0.0.0", "::"):  # noqa: S104 - asked for by name
             names |= {socket.gethostname(), *_own_addresses()}
         shown = bind if bind not in ("0.0.0.0", "::", "") else "127.0.0.1"  # noqa: S104
@@ -378,9 +401,16 @@ def _listener(bind: str, port: int) -> socket.socket:
     return listener
 
 
+def _is_loopback(bind: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(bind).is_loopback
+    return bind == "localhost"
+
+
 def _own_addresses() -> set[str]:
     with contextlib.suppress(OSError):
-        return {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None)}
+        found = {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None)}
+        return {f"[{a}]" if ":" in a else a for a in found}
     return set()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from tuning.retune import TuningGoal
 from tuning.types import Powers
+from twin.rig.gateway import RigGateway
 from twin.station.audit import AuditPoint
 from twin.station.frame import ROUTINE, Frame
 from twin.station.session import Session
@@ -14,6 +15,11 @@ from twin.station.session import Session
 LOG_ROWS = 500
 POWER_BLOCKS = 10
 """Power is shown as the mean of so many blocks: what sensor noise burns differs from one to the next."""
+
+LATELY_S = 60.0
+"""Trouble on the wire is worth a mark for so long; the counts stay."""
+
+STATION_LOST = "station lost: control off"
 
 TIGHT_SHARE = 0.7
 """A loop that needs more of a block's time than this is near its end."""
@@ -40,6 +46,21 @@ class WireState:
     notice: str = ""
 
 
+def wire_state(gateway: RigGateway) -> WireState:
+    """Read it off a connection."""
+    c, ppm = gateway.counts, gateway.drift.ppm
+    return WireState(
+        lost=c.lost,
+        late=c.late,
+        repeated=c.repeated,
+        reordered=c.reordered,
+        malformed=gateway.malformed,
+        restarts=gateway.restarts,
+        drift_ppm=ppm if math.isfinite(ppm) else None,
+        notice=gateway.notice,
+    )
+
+
 @dataclass(slots=True)
 class Panel:
     """Turns frames into rows of the log and a dictionary that is replaced as a whole.
@@ -60,6 +81,13 @@ class Panel:
     _loads: deque[float] = field(default_factory=lambda: deque(maxlen=20))
     _sent: dict[str, Any] | None = None
     _audit: AuditPoint | None = None
+    _troubles: tuple[int, float] = (0, -math.inf)
+
+    def jumped(self, time_s: float) -> None:
+        """Forget what does not go on after a jump in a recording."""
+        self._spent.clear()
+        self._sent, self._audit = None, None
+        self.add(time_s, "info", "the replay jumped here")
 
     def take(self, frame: Frame, in_loop_s: float, wire: WireState, unseen: int) -> None:
         """Show one frame."""
@@ -85,7 +113,7 @@ class Panel:
             "plant": session.plant.name,
             "config_id": block.config_id or session.plant.fingerprint,
             "model_id": session.identified_plant().fingerprint,
-            "wire": {name: getattr(wire, name) for name in WireState.__slots__},
+            "wire": self._wire(wire, block.end_s),
             "load": finite(load, 3),
             "unseen": unseen,
             "health": {
@@ -96,6 +124,7 @@ class Panel:
             "learner": learner,
             "control_on": block.control_on,
             "excitation_hz": None if frame.phasors is None else finite(frame.phasors.frequency_hz),
+            "excitation": self._excitation(frame),
             "performance": self._performance(frame, goal),
             "goal": goal_figures(goal),
             "approve": None if retuning is None else retuning.approve,
@@ -105,6 +134,22 @@ class Panel:
             "audit": None if self._audit is None else audit_figures(self._audit),
             "alarms": self._alarms(frame, load, wire, goal),
         }
+
+    def _wire(self, wire: WireState, now_s: float) -> dict[str, Any]:
+        """What the wire did, and whether something was amiss lately."""
+        troubles = wire.lost + wire.late + wire.malformed
+        if troubles > self._troubles[0]:
+            self._troubles = (troubles, now_s)
+        found = {name: getattr(wire, name) for name in WireState.__slots__}
+        return found | {"lately": now_s - self._troubles[1] < LATELY_S}
+
+    def _excitation(self, frame: Frame) -> dict[str, Any] | None:
+        """Peak of what excites, in its own unit: what a what-if may override."""
+        p = frame.phasors
+        if p is None:
+            return None
+        unit = next((c.unit for c in self.session.channels if c.name == p.reference), "")
+        return {"peak": finite(abs(p.amplitude[p.channels.index(p.reference)]), 4), "unit": unit}
 
     def _performance(self, frame: Frame, goal: TuningGoal) -> dict[str, Any] | None:
         p = frame.performance
@@ -132,7 +177,8 @@ class Panel:
     def _alarms(self, frame: Frame, load: float, wire: WireState, goal: TuningGoal) -> list[str]:
         found = []
         if wire.notice:
-            found.append(f"Rig: {wire.notice}")
+            remedy = " Press Control on when all is well." if wire.notice == STATION_LOST else ""
+            found.append(f"Rig: {wire.notice}.{remedy}")
         if frame.health.verdict in ("diverged", "no data"):
             found.append(f"Model {frame.health.verdict}: {frame.health.reason}")
         if load > TIGHT_SHARE:

@@ -1,11 +1,12 @@
 """The same loop on a recording, as fast as it goes."""
 
+import contextlib
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block
@@ -13,12 +14,16 @@ from twin.station.frame import Frame
 from twin.station.opened import Opened, ReplayOptions, open_any
 from twin.station.orders import Order
 from twin.station.outputs import Outputs
-from twin.station.player import Player
+from twin.station.playback import Playback
+from twin.station.player import CHECKPOINT_S, Player
 from twin.station.prediction import PredictionScore
 from twin.station.run import Loop
 from twin.station.session import Session
 
-__all__ = ["Opened", "Repeated", "ReplayOptions", "open_any", "run_replay"]
+if TYPE_CHECKING:
+    from twin.station.page_server import OperatorPage
+
+__all__ = ["Opened", "Repeated", "ReplayEnd", "ReplayOptions", "open_any", "run_replay"]
 
 
 def run_replay(
@@ -26,7 +31,7 @@ def run_replay(
     options: ReplayOptions,
     say: Callable[[str], None],
     progress: Callable[[int, int], None],
-    linger: Callable[[], None] | None = None,
+    stay: Callable[[], bool] | None = None,
     watch: Callable[[Session, Frame], None] | None = None,
     opened: Opened | None = None,
 ) -> dict[str, Any]:
@@ -40,8 +45,8 @@ def run_replay(
         Takes lines for the person.
     progress
         Takes samples done and samples in all.
-    linger
-        Called when the run is over and its recording finished, while the views are still served.
+    stay
+        With a page: whether it is to be served on though nobody looks at it. It is while somebody does.
     watch
         Takes the session and each frame that counts, after everything else has.
     opened
@@ -76,26 +81,42 @@ def run_replay(
         web=options.web,
         storage=options.storage,
     ) as outputs:
-        if outputs.url:
-            say(f"open {outputs.url}")
         loop = Loop(session, outputs)
+        page, playback = None, None
 
         def turn(
-            _: Session, block: Block, answers: tuple[Acknowledgement, ...], order: Order | None
+            current: Session, block: Block, answers: tuple[Acknowledgement, ...], order: Order | None
         ) -> Frame:
+            loop.session = current  # another one after a jump
             return loop.turn(block, answers, order)
 
-        player = Player(opened, session, turn, checkpoint_s=None)
-        player.seek(options.from_s)
-        for frame in player.play(options.to_s, options.speed):
+        def take(frame: Frame) -> None:
             repeated.add(frame)
             score.add(frame.block, frame.estimate)
             if watch is not None:
-                watch(session, frame)
+                watch(loop.session, frame)
             progress(frame.block.end_sample, opened.n_samples)
-        outputs.finish()
-        if linger is not None:
-            linger()
+
+        player = Player(opened, session, turn, checkpoint_s=CHECKPOINT_S if options.web else None)
+        if options.web:
+            page, playback = _page(player, loop, opened, options)
+        if page is None or playback is None:
+            player.seek(options.from_s)
+            for frame in player.play(options.to_s, options.speed):
+                take(frame)
+            outputs.finish()
+        else:
+            with page:
+                say(f"operator page: {page.url}   Ctrl-C ends")
+                if page.warning:
+                    say(f"warning: {page.warning}")
+                watched = page.desk.is_watched
+                with contextlib.suppress(ReplayEnd):
+                    playback.run(take, outputs.finish, lambda: watched() or (stay is not None and stay()))
+            outputs.finish()
+    jumped = playback is not None and playback.jumps > 0
+    if jumped:
+        say("there were jumps: the figures are of all that was shown, some of it perhaps twice")
     scores = score.scores()
     return {
         **loop.log.figures(),
@@ -107,12 +128,35 @@ def run_replay(
         "nrmse_without_input": _together([s.nrmse_without_input for s in scores]),
         "sensors": [asdict(s) for s in scores],
         "fitted_rows_left_out": [list(rows) for rows in opened.fitted_rows],
-        "decisions_repeated": repeated.verdict,
+        "decisions_repeated": None if jumped else repeated.verdict,
         "answers_recomputed": session.answers_worked_out,
         "realtime_factor": loop.realtime_factor,
         "remarks": list(opened.remarks),
         "recording": str(options.recording) if options.recording is not None else None,
     }
+
+
+class ReplayEnd(BaseException):
+    """The person at the terminal has had enough of a page."""
+
+
+def _page(
+    player: Player, loop: Loop, opened: Opened, options: ReplayOptions
+) -> "tuple[OperatorPage, Playback]":
+    """The page of a live run, but nothing can be sent, and the recording is played from there."""
+    from twin.station.desk import Desk
+    from twin.station.page_server import OperatorPage
+
+    outputs = loop.outputs
+    desk = Desk(player.session, unseen=lambda: outputs.frames_unseen, viewer_url=outputs.url)
+    loop.desk = desk
+    playback = Playback(
+        player, opened.sample_rate_hz, opened.n_samples,
+        speed=options.speed, from_s=options.from_s, to_s=options.to_s,
+        seekable=options.recording is None, jumped=lambda: desk.jumped(player.session, player.time_s),
+    )  # fmt: skip
+    desk.playback = playback
+    return OperatorPage(desk, options.bind, options.port), playback
 
 
 class Repeated:
