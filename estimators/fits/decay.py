@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import periodogram
-from scipy.stats import chi2
 
 from estimators.fits.free_decays import Decay, envelope, find_decays, main_frequency
+from estimators.fits.homogeneity import disagree, with_scatter
 from estimators.fits.ringing import RingingFit, fit_ringing
 from estimators.fits.types import Mode
 from twin.plant.errors import InputError
@@ -146,7 +146,7 @@ def fit_decay(
         decays=tuple(decays),
         model=whole.model,
         residual_rms=whole.residual_rms,
-        amplitude_dependent=_differ(bands),
+        amplitude_dependent=disagree([band.mode for band in bands], 1e-3),
     )
 
 
@@ -327,39 +327,12 @@ def _band(
         return None
     start = [(main.frequency_hz, max(main.damping_ratio, 1e-5))]
     fit = fit_ringing(pieces, rate_hz, start)
-    mode = _with_scatter(fit, pieces, rate_hz)
+    mode = fit.modes[0]
+    if len(pieces) > 1:
+        start = [(mode.frequency_hz, mode.damping_ratio)]
+        mode = with_scatter(mode, [fit_ringing([p], rate_hz, start).modes[0] for p in pieces])
     if not mode.damping_std < 0.5 or mode.damping_std > max(2.0 * abs(mode.damping_ratio), 0.002):
         return None
     return AmplitudeBand(
         low, high, mode, len(pieces), sum(len(p) for p in pieces) * mode.frequency_hz / rate_hz
     )
-
-
-def _with_scatter(fit: RingingFit, pieces: list[Array], rate_hz: float) -> Mode:
-    """Widen the standard deviations if single decays differ by clearly more than their own errors."""
-    mode = fit.modes[0]
-    if len(pieces) < 2:
-        return mode
-    singles = [fit_ringing([p], rate_hz, [(mode.frequency_hz, mode.damping_ratio)]).modes[0] for p in pieces]
-    out = []
-    for name, std in (("frequency_hz", "frequency_std_hz"), ("damping_ratio", "damping_std")):
-        x = np.array([getattr(s, name) for s in singles])
-        weight = 1.0 / np.maximum(np.array([getattr(s, std) for s in singles]), 1e-300) ** 2
-        square = float(np.sum(weight * (x - np.sum(weight * x) / np.sum(weight)) ** 2))
-        degrees = len(x) - 1
-        out.append(np.sqrt(square / degrees) if chi2.sf(square, degrees) < 0.01 else 1.0)
-    return Mode(
-        mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1]
-    )
-
-
-def _differ(bands: list[AmplitudeBand]) -> bool:
-    if len(bands) < 2:
-        return False
-    for name, std in (("frequency_hz", "frequency_std_hz"), ("damping_ratio", "damping_std")):
-        x = np.array([getattr(b.mode, name) for b in bands])
-        weight = 1.0 / np.maximum(np.array([getattr(b.mode, std) for b in bands]), 1e-300) ** 2
-        square = float(np.sum(weight * (x - np.sum(weight * x) / np.sum(weight)) ** 2))
-        if chi2.sf(square, len(x) - 1) < 1e-3:
-            return True
-    return False

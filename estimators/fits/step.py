@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 from scipy.signal import lfilter
-from scipy.stats import chi2
 
+from estimators.fits.homogeneity import with_scatter
 from estimators.fits.ringing import TAU, RingingFit, damped_pair, fit_ringing, spectral_covariance
 from estimators.fits.separable import SeparableFit, fit_separable
 from estimators.fits.types import Mode
@@ -138,7 +138,7 @@ def fit_steps(pieces: Sequence[StepPiece], sample_rate_hz: float) -> StepFit:
     zeta = mode.damping_ratio
     overshoot = float(np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2))) if abs(zeta) < 1.0 else 0.0
     return StepFit(
-        _with_scatter(mode, singles), tuple(singles), method, delay, rise, overshoot, model, residual
+        with_scatter(mode, singles), tuple(singles), method, delay, rise, overshoot, model, residual
     )
 
 
@@ -276,22 +276,6 @@ def _first_guess(pieces: Sequence[StepPiece], rate_hz: float) -> tuple[float, fl
             frequencies.append(0.25 * rate_hz / max(1, int(reached[0]) if len(reached) else len(y) // 4))
             dampings.append(0.7)
     return float(np.median(frequencies)), float(np.median(dampings))
-
-
-def _with_scatter(mode: Mode, singles: Sequence[Mode]) -> Mode:
-    """Widen the standard deviations if single steps differ by clearly more than their own errors."""
-    if len(singles) < 2:
-        return mode
-    out = []
-    for name, std in (("frequency_hz", "frequency_std_hz"), ("damping_ratio", "damping_std")):
-        x = np.array([getattr(s, name) for s in singles])
-        weight = 1.0 / np.maximum(np.array([getattr(s, std) for s in singles]), 1e-300) ** 2
-        square = float(np.sum(weight * (x - np.sum(weight * x) / np.sum(weight)) ** 2))
-        degrees = len(x) - 1
-        out.append(np.sqrt(square / degrees) if chi2.sf(square, degrees) < 0.01 else 1.0)
-    return Mode(
-        mode.frequency_hz, mode.damping_ratio, mode.frequency_std_hz * out[0], mode.damping_std * out[1]
-    )
 
 
 def _placed(tails: Sequence[Array], pieces: Sequence[StepPiece]) -> tuple[Array, ...]:
