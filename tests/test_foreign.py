@@ -135,11 +135,79 @@ def test_two_candidates_are_named_and_none_is_taken(save: Save, tmp_path: Path) 
     )
 
 
-def test_with_two_channels_missing_nothing_is_guessed(save: Save, tmp_path: Path) -> None:
+def test_two_channels_of_unlike_dimension_are_guessed_each_by_its_own(save: Save, tmp_path: Path) -> None:
     path = save(t=t(), y=np.ones(50), u=np.ones(50))
     (tmp_path / "run.json").write_text(json.dumps({"channels": {"u": "V", "y": "mm"}}))
-    with pytest.raises(InputError, match=r"'tip' \[m\] \(could be y\)[^$]*'piezo' \[V\] \(could be u\)"):
-        open_foreign(path, plant())
+    recording = open_foreign(path, plant())
+    assert [(m.channel, m.array) for m in recording.mapping] == [("tip", "y"), ("piezo", "u")]
+    assert len(recording.guesses) == 2
+    assert recording.guesses[0].startswith("tip <- y [mm -> m, x 0.001]: guessed")
+
+
+SECOND = '[[sensor]]\nname = "root"\nkind = "displacement"\nof = "body"\nnoise_density = 1e-5\n'
+
+
+def test_arrays_of_like_dimension_are_told_apart_by_words_of_the_names_or_not_at_all(
+    save: Save, tmp_path: Path
+) -> None:
+    beside = tmp_path / "run.json"
+    path = save(t=t(), laser_root=np.ones(50), TipLaser=np.ones(50), piezo=np.ones(50))
+    beside.write_text(json.dumps({"channels": {"laser_root": "mm", "TipLaser": "um", "piezo": "V"}}))
+    recording = open_foreign(path, plant(extra=SECOND))
+    assert {m.channel: m.array for m in recording.mapping} == {
+        "tip": "TipLaser", "root": "laser_root", "piezo": "piezo",
+    }  # fmt: skip
+    assert all("is called" in guess for guess in recording.guesses)
+    path = save(t=t(), one=np.ones(50), other=np.ones(50), piezo=np.ones(50))
+    beside.write_text(json.dumps({"channels": {"one": "mm", "other": "mm", "piezo": "V"}}))
+    with pytest.raises(InputError, match=r"'tip' \[m\] \(could be one or other\)[^$]*'root' \[m\]"):
+        open_foreign(path, plant(extra=SECOND))
+
+
+def test_a_unit_that_nobody_stated_is_a_guess_unless_a_person_named_the_array(save: Save) -> None:
+    path = save(t=t(), tip=np.ones(50), y=np.ones(50), piezo=np.zeros(50))
+    assert [m.guess != "" for m in open_foreign(path, plant()).mapping] == [True, True]
+    given = open_foreign(path, plant(), channels={"tip": "y", "piezo": "piezo:V"})
+    assert given.guesses == ()
+
+
+def test_sidecar_written_of_a_recording_leaves_nothing_to_guess(save: Save, tmp_path: Path) -> None:
+    keep = np.r_[0:20, 25:50]
+    path = save(t=t()[keep], laser=np.arange(45.0), piezo=np.zeros(45))
+    (tmp_path / "run.json").write_text(json.dumps({"channels": {"laser": "mm tip"}}))
+    first = open_foreign(path, plant())
+    assert len(first.guesses) == 2
+    (tmp_path / "run.toml").write_text(first.sidecar)
+    again = open_foreign(path, plant())
+    assert again.guesses == ()
+    assert again.n_samples == first.n_samples == 50
+    np.testing.assert_array_equal(again.values, first.values)
+    assert again.sample_rate_hz == first.sample_rate_hz
+
+
+@pytest.mark.parametrize(
+    ("place", "factor"),
+    [
+        ('{ array = "y", unit = "g", scale = 50.0 }', None), ('{ array = "y", unit = "mm", scale = 50 }', 0.05),
+        ('{ array = "y", scale = 2.5 }', 2.5), ('{ array = "y", unit = "mV", sensitivity = "10 mV/mm" }', 1e-4),
+        ('{ array = "y", unit = "V", scale = 2.0, sensitivity = "10 mV/mm" }', 0.2), ('"y:mV@10 mV/mm"', 1e-4),
+        ('"y:50 mm"', 0.05), ('{ array = "y", unit = "mV", sensitivity = "10 pC/mm" }', None),
+        ('{ array = "y", scale = 0.0 }', None), ('{ array = "y", sensitivity = "10 mV/mm" }', None),
+    ],
+)  # fmt: skip
+def test_sidecar_says_what_a_sample_of_one_stands_for(
+    save: Save, tmp_path: Path, place: str, factor: float | None
+) -> None:
+    path = save(t=t(), y=np.full(50, 3.0), piezo=t())
+    (tmp_path / "run.toml").write_text(f"[channels]\ntip = {place}\n")
+    if factor is None:
+        with pytest.raises(InputError, match=r"unit '.*'|a scale of 0|sensitivity needs the unit"):
+            open_foreign(path, plant())
+        return
+    recording = open_foreign(path, plant())
+    np.testing.assert_allclose(recording.values[:, 0], 3.0 * factor, rtol=1e-12)
+    (tmp_path / "run.toml").write_text(recording.sidecar)
+    np.testing.assert_array_equal(open_foreign(path, plant()).values, recording.values)
 
 
 def test_command_that_was_not_recorded_is_left_out_when_a_person_says_so(save: Save, tmp_path: Path) -> None:
@@ -233,7 +301,23 @@ def test_other_units_and_what_g_is_go_by_the_dimension_expected(
 
 
 @pytest.mark.parametrize(
-    "unit", ["MM", "", "m/s3", "G", "tip", "dB", "degC", "m**9**9", "9**9**9", "a" * 99, "0 g", "1e999 g", "g pk", "1"]
+    "unit",
+    [
+        "MM",
+        "",
+        "m/s3",
+        "G",
+        "tip",
+        "dB",
+        "degC",
+        "m**9**9",
+        "9**9**9",
+        "a" * 99,
+        "0 g",
+        "1e999 g",
+        "g pk",
+        "1",
+    ],
 )
 def test_what_is_no_unit_of_a_channel_is_not_made_into_one(unit: str) -> None:
     known = to_si(unit)
@@ -262,8 +346,10 @@ def test_words_of_a_description_are_not_taken_for_units(word: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unit", "why"), [
-        ("smoot2x", "unit 'smoot2x' is not known"), ("kg", "unit 'kg' is kg, the channel is m"),
+    ("unit", "why"),
+    [
+        ("smoot2x", "unit 'smoot2x' is not known"),
+        ("kg", "unit 'kg' is kg, the channel is m"),
         ("mV", "unit 'mV' is V, the channel is m"),
         ("dB", "unit 'dB' is logarithmic or has an offset: there is no factor to SI"),
         ("degC", "unit 'degC' is logarithmic or has an offset: there is no factor to SI"),

@@ -15,12 +15,15 @@ from twin.plant.linear import Array, read_only
 from twin.rig.archives.base import Archive
 from twin.rig.archives.detect import open_archive
 from twin.rig.arrayref import ArrayRef
-from twin.rig.mapping import TIME_NAMES, ChannelMapping, map_channels
-from twin.rig.sidecar import Sidecar, find_sidecar
+from twin.rig.mapping import TIME_NAMES, ChannelMapping, map_channels, plant_channels
+from twin.rig.sidecar import Sidecar, find_sidecar, sidecar_text
 from twin.rig.timebase import Gap, Stamps, TimeBase, time_base
 
 PART_ROWS = 1 << 18
 """Rows read from the file at a time."""
+
+APART = 0.5
+"""Channels that begin further apart than this, in samples, do not belong into the same row."""
 
 ABSURD = 1e12
 ABSURD_SHARE = 0.2
@@ -63,6 +66,8 @@ class ForeignRecording:
         Length of a block [s]; the last one may be shorter.
     ranges
         (n_channels,) largest magnitude each channel can measure, infinity where unknown.
+    sidecar
+        All of this as the text of a sidecar (TOML), so that nothing need be guessed again.
     """
 
     path: Path
@@ -73,9 +78,15 @@ class ForeignRecording:
     notes: tuple[str, ...]
     block_s: float
     ranges: Array = field(repr=False)
+    sidecar: str = field(repr=False)
     _archive: Archive = field(repr=False)
     _columns: tuple[_Column, ...] = field(repr=False)
     _gaps: tuple[Gap, ...] = field(repr=False)
+
+    @property
+    def guesses(self) -> tuple[str, ...]:
+        """What nobody has said, a line each: for a person to confirm before anything is made of it."""
+        return tuple(str(entry) for entry in self.mapping if entry.guess)
 
     @property
     def block_samples(self) -> int:
@@ -165,8 +176,8 @@ def open_foreign(
     """Open a recording of any known format and find the plant's channels in it.
 
     A plant's channels are its sensors and its actuators' recorded commands. Each is looked up in the given
-    options, then in the sidecar, then under its ``recorded_as`` in the plant, then under its own name; a last
-    one left over is guessed only if a single array with a fitting unit is left (see `map_channels`).
+    options, then in the sidecar, then under its ``recorded_as`` in the plant, then under its own name; what is left
+    over is guessed where there is no choice (see `map_channels`), and said in `ForeignRecording.guesses`.
 
     Channels of different rates are not resampled: a slower one, whose rate divides the fastest, has a valid sample
     where it was sampled and is masked between.
@@ -197,14 +208,16 @@ def open_foreign(
         raise InputError(f"block length [s]: must be a positive number of s, got {block_s!r}")
     archive = open_archive(path)
     beside = _with_own_units(find_sidecar(path, sidecar), archive)
-    mapping, notes = map_channels(path, plant, archive.names, channels or {}, beside)
+    mapping, notes = map_channels(path, plant, archive.names, channels or {}, beside, archive.shares)
     columns, own_hz = _columns(archive, mapping, sample_rate_hz)
     n_rows = next(c.n_rows for c in columns if c.stride == 1)
     if n_rows == 0:
         raise InputError(f"{path}: array '{mapping[0].ref}' is empty; there is nothing to replay")
     for column in columns:
         _look(archive, column)
-    base = _time_base(archive, beside, sample_rate_hz, own_hz, n_rows)
+    _begin_together(archive, mapping, max(rate for rate in (own_hz, sample_rate_hz, 0.0) if rate is not None))
+    stamped_by = _stamped_by(archive, beside)
+    base = _time_base(archive, beside, stamped_by, sample_rate_hz, own_hz, n_rows)
     if base.gaps and any(c.stride > 1 for c in columns):
         raise InputError(
             f"{path}: has both gaps in time and channels of different rates; export the channels apart"
@@ -222,6 +235,7 @@ def open_foreign(
         notes=(base.note, *slow, *notes, *beside.notes),
         block_s=block_s,
         ranges=read_only([limits.get(entry.channel) or np.inf for entry in mapping]),
+        sidecar=_as_sidecar(plant, mapping, stamped_by if base.by_stamps else None, base.rate_hz),
         _archive=archive,
         _columns=columns,
         _gaps=base.gaps,
@@ -301,9 +315,31 @@ def _look(archive: Archive, column: _Column) -> None:
         )
 
 
-def _time_base(
-    archive: Archive, beside: Sidecar, option_hz: float | None, own_hz: float | None, n_rows: int
-) -> TimeBase:
+def _begin_together(archive: Archive, mapping: tuple[ChannelMapping, ...], rate_hz: float) -> None:
+    """Complain of channels whose first samples were not taken at the same instant."""
+    starts = {m.channel: archive.starts_s[m.ref.array] for m in mapping if m.ref.array in archive.starts_s}
+    if not starts:
+        return
+    first, last = min(starts, key=lambda k: starts[k]), max(starts, key=lambda k: starts[k])
+    apart = starts[last] - starts[first]
+    if apart * rate_hz > APART:
+        raise InputError(
+            f"{archive.path}: channel '{last}' begins {apart:.6g} s after '{first}', by what the file says; export "
+            f"both from one instant on, or leave one out with --channel {last}=none"
+        )
+
+
+def _as_sidecar(
+    plant: Plant, mapping: tuple[ChannelMapping, ...], time: ArrayRef | None, rate_hz: float
+) -> str:
+    found = {m.channel: ArrayRef(m.ref.array, m.ref.index, m.unit) for m in mapping}
+    return sidecar_text(
+        None if time is not None else rate_hz, time, {name: found.get(name) for name in plant_channels(plant)}
+    )
+
+
+def _stamped_by(archive: Archive, beside: Sidecar) -> ArrayRef | None:
+    """The array of time stamps, with its unit where one is stated."""
     given = beside.time
     if given is not None and given.array not in archive.names:
         raise InputError(
@@ -312,9 +348,18 @@ def _time_base(
         )
     by_name = {name.lower(): name for name in reversed(archive.names)}
     ref = given or next((ArrayRef(by_name[name]) for name in TIME_NAMES if name in by_name), None)
-    stamps = None
-    if ref is not None and option_hz is None:
-        stamps = _stamps(archive, ref, ref.unit or beside.units.get(ref.array))
+    return None if ref is None else replace(ref, unit=ref.unit or beside.units.get(ref.array))
+
+
+def _time_base(
+    archive: Archive,
+    beside: Sidecar,
+    ref: ArrayRef | None,
+    option_hz: float | None,
+    own_hz: float | None,
+    n_rows: int,
+) -> TimeBase:
+    stamps = None if ref is None or option_hz is not None else _stamps(archive, ref, ref.unit)
     return time_base(
         archive.path, stamps=stamps, option_hz=option_hz, own_hz=own_hz, beside=beside, n_rows=n_rows
     )

@@ -6,6 +6,8 @@ Two forms are read. ``FILE.toml`` is written for this program::
     [channels]
     tip = { array = "y", unit = "mm" }
     piezo = "u:V"                 # the short form; "none" for what was not recorded
+    table = { array = "channel1", unit = "g", scale = 50.0 }              # a sample of 1 is 50 g
+    shaker = { array = "ai0", unit = "mV", sensitivity = "22.5 mV/N" }    # volts of a sensor
 
 ``FILE.json`` is the form in which measured data sets are often published: ``fs_hz``, and under ``channels``
 one text for each array that begins with its unit, ``{"y": "mm tip laser"}``.
@@ -28,6 +30,7 @@ from twin.rig.arrayref import ArrayRef, parse_array_ref
 from twin.rig.units import is_common
 
 NOT_RECORDED = "none"
+_Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,8 @@ class _Place(Frozen):
 
     array: str = Field(min_length=1)
     unit: str | None = None
+    scale: _Finite | None = None
+    sensitivity: str | None = None
 
 
 def _from_short_form(value: Any) -> Any:
@@ -145,11 +150,37 @@ def _read_toml(path: Path) -> Sidecar:
 
 def _ref(place: _Place, where: str) -> ArrayRef:
     ref = parse_array_ref(place.array, where)
-    if place.unit is None:
-        return ref
-    if ref.unit is not None and ref.unit != place.unit:
+    if place.unit is not None and ref.unit is not None and ref.unit != place.unit:
         raise InputError(f"{where}: array says {ref.unit!r} and unit says {place.unit!r}; keep one")
-    return ArrayRef(ref.array, ref.index, place.unit)
+    unit = place.unit or ref.unit
+    if place.scale is not None:
+        if place.scale == 0.0:
+            raise InputError(f"{where}: a scale of 0 leaves nothing; give what a sample of 1 stands for")
+        unit = f"{place.scale!r} {unit or ''}".strip()
+    if place.sensitivity is not None:
+        if unit is None:
+            raise InputError(f"{where}: sensitivity needs the unit of what was sampled, such as unit = \"V\"")
+        unit = f"{unit}@{place.sensitivity}"
+    return ArrayRef(ref.array, ref.index, unit)
+
+
+def sidecar_text(
+    sample_rate_hz: float | None, time: ArrayRef | None, channels: Mapping[str, ArrayRef | None]
+) -> str:
+    """The TOML form of what is known about a recording; a channel of None was not recorded."""
+    lines = [] if sample_rate_hz is None else [f"sample_rate_hz = {float(sample_rate_hz)!r}"]
+    lines += [] if time is None else [f"time = {_place(time)}"]
+    lines += ["", "[channels]"]
+    lines += [f"{_text(k)} = {_text(NOT_RECORDED) if r is None else _place(r)}" for k, r in channels.items()]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _place(ref: ArrayRef) -> str:
+    return _text(str(ref) if ref.unit is None else f"{ref}:{ref.unit}")
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)  # a basic string of TOML is one of JSON
 
 
 def _read_json(path: Path) -> Sidecar:

@@ -39,11 +39,14 @@ class TimeBase:
         Where that comes from, in a sentence.
     gaps
         Where rows are missing, in the file's order.
+    by_stamps
+        Rate and gaps are those of the time stamps.
     """
 
     rate_hz: float
     note: str
     gaps: tuple[Gap, ...] = ()
+    by_stamps: bool = False
 
     @property
     def missing(self) -> int:
@@ -130,13 +133,14 @@ def time_base(
             found.rate_hz,
             f"sample rate {found.rate_hz:g} Hz from time array '{stamps.name}'{gaps}",
             tuple(found.gaps),
+            by_stamps=True,
         )
     if abs(found.rate_hz - nominal) > UNEVEN * nominal:
         raise InputError(
             f"{path}: time array '{stamps.name}' says {found.rate_hz:g} Hz but {said_by} says {nominal:g} Hz; "
             "correct the sidecar, or decide with --sample-rate HZ"
         )
-    return TimeBase(nominal, said + gaps, tuple(found.gaps))
+    return TimeBase(nominal, said + gaps, tuple(found.gaps), by_stamps=bool(found.gaps))
 
 
 class _Steps:

@@ -4,6 +4,7 @@ import signal
 import sys
 from contextlib import suppress
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -12,6 +13,7 @@ from rich.table import Table
 
 from twin.plant.errors import InputError, RunError
 from twin.station.campaign.command import campaign
+from twin.station.confirm import WriteSidecarOption, YesOption, accept_recording
 from twin.station.fit import fit_app
 from twin.station.library import recordings_app
 from twin.station.terminal import (
@@ -230,7 +232,11 @@ def demo(
 )
 def replay(
     file: Annotated[
-        Path, typer.Argument(help="Recording: .rrd of this program, or .npz.", show_default=False)
+        Path,
+        typer.Argument(
+            help="Recording: .rrd, or .tdms, .mat, .h5, .csv, .parquet, .uff, .wav, .npz with --plant.",
+            show_default=False,
+        ),
     ],
     plant: Annotated[
         str | None, typer.Option(metavar="PRESET|FILE", help="Plant; an .rrd carries its own.")
@@ -238,17 +244,23 @@ def replay(
     channel: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=ARRAY[:UNIT]", help="Where a sensor or command lies in an .npz; may be repeated."
+            metavar="NAME=ARRAY[:UNIT]",
+            help="Where a sensor or command lies: y:mm, data[:,2]:g, ch1:50 g, ai0:mV@100 mV/g, or none; "
+            "may be repeated.",
         ),
     ] = None,
     sample_rate: Annotated[
         float | None,
-        typer.Option(min=1e-6, metavar="HZ", help="Sample rate of an .npz in Hz, if it does not say."),
+        typer.Option(min=1e-6, metavar="HZ", help="Sample rate in Hz, if the file does not say."),
     ] = None,
     sidecar: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="TOML or JSON with rate, units and channels of an .npz."),
+        typer.Option(
+            metavar="FILE", help="TOML or JSON with rate, units and channels; else the one beside the file."
+        ),
     ] = None,
+    yes: YesOption = False,
+    write_sidecar: WriteSidecarOption = False,
     save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record the replay.")] = None,
     view: Annotated[bool, typer.Option("--view", help="Open Rerun's viewer.")] = False,
     web: Annotated[
@@ -329,6 +341,7 @@ def replay(
         speed=(1.0 if web else 0.0) if speed is None else speed,
         bind=bind,
         port=port,
+        accept=partial(accept_recording, yes=yes, write_sidecar=write_sidecar),
     )
 
     def end(_signal: int, _frame: object) -> NoReturn:

@@ -1,19 +1,24 @@
 """``atmd fit``: parameters from separate tests, each with its standard deviation, a table and a picture."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from twin.plant.errors import InputError
+from twin.station.confirm import YesOption, confirm_guesses
 from twin.station.terminal import JsonOption, must_be_writable, report, say
+
+if TYPE_CHECKING:
+    from twin.station.fit_data import TestFile
 
 fit_app = typer.Typer(
     name="fit",
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Fit modes, springs and dampers to recordings of separate tests, with standard deviations.",
+    help="Fit modes, springs and dampers to recordings of separate tests, with standard deviations. What is guessed "
+    "about a file is shown, confirmed at a terminal, and listed in the JSON under guesses.",
 )
 
 FileArgument = Annotated[
@@ -65,6 +70,7 @@ def added_mass(
         typer.Option(min=1e-6, metavar="HZ", help="Also say what mass to add for this frequency."),
     ] = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Stiffness and moving mass of a spring from its resonance against added mass (thesis eq. 7-1).
@@ -79,7 +85,7 @@ def added_mass(
     _check(plot, json_to)
     test = open_test(file, channel or [], None, sidecar)
     result, draw = run_added_mass(test, tune_to)
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 @fit_app.command(epilog="Example: atmd fit transmissibility absorber.csv --band 30:58 --json -")
@@ -89,6 +95,7 @@ def transmissibility(
     sidecar: SidecarOption = None,
     band: BandOption = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Natural frequency and damping of an absorber from its transmissibility (thesis eq. 5-4).
@@ -102,7 +109,7 @@ def transmissibility(
     _check(plot, json_to)
     test = open_test(file, channel or [], None, sidecar, "response")
     result, draw = run_transmissibility(test, _pair(band))
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 @fit_app.command(epilog="Example: atmd fit frf structure.npz --modes 3 --plot structure.png")
@@ -123,6 +130,7 @@ def frf(
         typer.Option(metavar="KIND", help="receptance, mobility or accelerance, if the file does not say."),
     ] = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Modal parameters from measured frequency responses, all responses together.
@@ -137,7 +145,7 @@ def frf(
     _check(plot, json_to)
     test = open_test(file, channel or [], None, sidecar, "response")
     result, draw = run_frf(test, _pair(band), modes, window, kind)
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 @fit_app.command(epilog="Example: atmd fit decay beam.npz --channel y:mm --plot beam.png")
@@ -158,6 +166,7 @@ def decay(
         ),
     ] = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Frequency and damping by amplitude from free decays, which are found in the record.
@@ -171,7 +180,7 @@ def decay(
     _check(plot, json_to)
     test = open_test(file, channel or [], sample_rate, sidecar, "signal")
     result, draw = run_decay(test, _pair(band), _edges(amplitudes), modes)
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 @fit_app.command(epilog="Example: atmd fit step circuit.npz --channel input=u:V --channel output=y:V")
@@ -181,6 +190,7 @@ def step(
     sample_rate: RateOption = None,
     sidecar: SidecarOption = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Natural frequency and damping from second-order step responses, all steps of all records together.
@@ -194,7 +204,7 @@ def step(
     _check(plot, json_to)
     test = open_test(file, channel or [], sample_rate, sidecar, "output")
     result, draw = run_step(test)
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 @fit_app.command(epilog="Example: atmd fit damper damper.npz --channel force=F:N --channel velocity=v:mm/s")
@@ -204,6 +214,7 @@ def damper(
     sample_rate: RateOption = None,
     sidecar: SidecarOption = None,
     plot: PlotOption = None,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Equivalent damping from force and motion, and whether a linear damper describes the data at all.
@@ -218,7 +229,7 @@ def damper(
     _check(plot, json_to)
     test = open_test(file, channel or [], sample_rate, sidecar, "velocity")
     result, draw = run_damper(test)
-    _finish(test.notes, result, draw, plot, json_to)
+    _finish(test, result, draw, plot, json_to, yes=yes)
 
 
 def _check(plot: Path | None, json_to: str | None) -> None:
@@ -232,10 +243,12 @@ def _check(plot: Path | None, json_to: str | None) -> None:
 
 
 def _finish(
-    notes: list[str], result: dict[str, Any], draw: Any, plot: Path | None, json_to: str | None
+    test: "TestFile", result: dict[str, Any], draw: Any, plot: Path | None, json_to: str | None, *, yes: bool
 ) -> None:
-    for note in notes:
+    for note in test.notes:
         say(note)
+    confirm_guesses(test.guesses, yes=yes)
+    result["guesses"] = test.guesses
     if plot is not None:
         from twin.station.fit_plots import save_plot
 

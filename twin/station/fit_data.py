@@ -105,7 +105,9 @@ class TestFile:
     chosen
         Role to series as the person said.
     notes
-        What was guessed, for people.
+        What was found, for people.
+    guesses
+        What nothing in the file or beside it says, for people to confirm.
     """
 
     __test__ = False
@@ -118,6 +120,7 @@ class TestFile:
     chosen: dict[str, ArrayRef]
     rate_option_hz: float | None
     notes: list[str] = field(default_factory=list)
+    guesses: list[str] = field(default_factory=list)
 
     def error(self, message: str) -> InputError:
         """Error that names the file and what is in it."""
@@ -146,8 +149,23 @@ class TestFile:
         best = max(score for score, _ in scored)
         channel = next(s.channel for score, s in scored if score == best)
         found = [s for _, s in scored if s.channel == channel]
-        self.notes.append(f"{role} <- {_names(found)}{_stated(found[0])}")
+        line = f"{role} <- {_names(found)}{_stated(found[0])}"
+        if why := self._said(found[0], role):
+            self.notes.append(f"{line}: {why}")
+        else:
+            self.guesses.append(f"{line}: by its letter alone")
         return found
+
+    def _said(self, s: Series, role: str) -> str:
+        """What names a series of a role; empty if only a letter does."""
+        if _named(s, role):
+            return "named or described so"
+        dimension = DIMENSIONS.get(role)
+        if dimension is not None and s.si is not None and s.si[0] in dimension:
+            channels = {o.channel for o in self.series if o.si is not None and o.si[0] == s.si[0]}
+            if len(channels) == 1:
+                return f"the only one in {s.unit}"
+        return ""
 
     def rate(self, n: int) -> float:
         """Sample rate [Hz] of series with n samples.
@@ -328,6 +346,13 @@ def _score(s: Series, role: str) -> int:
     return points
 
 
+def _named(s: Series, role: str) -> bool:
+    """Whether a word of the role stands in what a series is called or described as."""
+    return any(
+        len(word) > 2 and any(w.startswith(word) for w in s.words) for word in WORDS.get(role, (role,))
+    )
+
+
 def _is(s: Series, ref: ArrayRef) -> bool:
     bare = str(ref).replace(" ", "")
     return (
@@ -360,7 +385,7 @@ def _facts(path: Path, sidecar: Path | None) -> Mapping[str, Any]:
         return {}
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}  # the sidecar's own reader has said so
     return found if isinstance(found, dict) else {}
 

@@ -270,7 +270,7 @@ def _one(file: TestFile, role: str, exclude: Series | None = None) -> Series:
 def _si(file: TestFile, s: Series, si_unit: str, assumed: str) -> Array:
     values = s.real()
     if not s.unit:
-        file.notes.append(f"{s.name}: no unit stated, taken as {assumed}")
+        file.guesses.append(f"{s.name}: no unit stated, taken as {assumed}")
         return values
     known = to_si(s.unit, si_unit)
     if known is None or known[0] != si_unit:
@@ -325,7 +325,7 @@ def _step_channels(file: TestFile) -> tuple[list[Series], list[Series]]:
         best = max(scores, key=lambda c: scores[c]) if scores else ""
         inputs = channels[best] if best and scores[best] > 0.9 and len(channels) > 1 else []
         if inputs:
-            file.notes.append(f"input <- {inputs[0].name} (a step or square wave)")
+            file.guesses.append(f"input <- {inputs[0].name}: a step or square wave")
     if not outputs:
         left = {c: g for c, g in channels.items() if not inputs or c != inputs[0].channel}
         if not left:
@@ -333,7 +333,11 @@ def _step_channels(file: TestFile) -> tuple[list[Series], list[Series]]:
         named = [c for c, g in left.items() if c.lower() in ("y", "output", "out", "response")]
         best = named[0] if named else max(left, key=lambda c: _jump(left[c][0].real()))
         outputs = left[best]
-        file.notes.append(f"output <- {outputs[0].name}{f' [{outputs[0].unit}]' if outputs[0].unit else ''}")
+        line = f"output <- {outputs[0].name}{f' [{outputs[0].unit}]' if outputs[0].unit else ''}"
+        if named or len(left) == 1:
+            file.notes.append(line)
+        else:
+            file.guesses.append(f"{line}: it jumps most")
     return outputs, inputs
 
 
@@ -380,7 +384,7 @@ def _kind(file: TestFile, option: str | None, text: str) -> ResponseKind:
     for kind, words in _KINDS.items():
         if any(w in said for w in words):
             return kind
-    file.notes.append("responses taken as accelerance; --kind receptance or mobility if they are not")
+    file.guesses.append("responses taken as accelerance; --kind receptance or mobility if they are not")
     return "accelerance"
 
 

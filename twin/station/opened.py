@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -13,11 +13,12 @@ from twin.plant.blocks import Block, Channel
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
-from twin.rig.foreign import open_foreign
+from twin.rig.foreign import ForeignRecording, open_foreign
 from twin.rig.recorded import HELD_BYTES, Recording, open_recording
 from twin.rig.regroup import in_pieces, restored
 from twin.rig.storage import Storage
 from twin.station.answers import NOTHING_KNOWN, KnownAnswers, known_answers
+from twin.station.confirm import accept_recording
 from twin.station.orders import Order
 from twin.station.session import Session, SessionSettings, settings_from
 from twin.station.worker import AsRecorded, TunerHere, as_recorded
@@ -50,6 +51,9 @@ class ReplayOptions:
         1 keeps the time of the data, 0 does not wait.
     bind, port
         Where the page is served, if ``web``; port 0 takes a free one.
+    accept
+        Is shown a foreign recording before anything is made of it, and raises if what was guessed about it may not be
+        used; unless given, nothing guessed is.
     """
 
     plant: str | None = None
@@ -67,6 +71,7 @@ class ReplayOptions:
     speed: float = 0.0
     bind: str = "127.0.0.1"
     port: int = 0
+    accept: Callable[[ForeignRecording], None] = accept_recording
 
 
 class BlockSource(Protocol):
@@ -207,6 +212,7 @@ def _open_foreign(path: Path, options: ReplayOptions) -> Opened:
     recording = open_foreign(
         path, plant, channels=options.channels, sample_rate_hz=options.sample_rate_hz, sidecar=options.sidecar
     )
+    options.accept(recording)
     remarks = [*(str(entry) for entry in recording.mapping), *recording.notes]
     fitted = tuple((f.first_row, f.last_row) for f in plant.fitted_on if f.recording == path.name)
     if not states_disturbances(plant):

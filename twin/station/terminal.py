@@ -30,11 +30,19 @@ def say(line: str) -> None:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on a terminal while the block runs; yields ``update(done, total)``."""
+    """Show progress on a terminal from the first ``update(done, total)`` on; until then a person may be asked."""
     columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, console=people, transient=True, disable=not people.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    bar = Progress(*columns, console=people, transient=True, disable=not people.is_terminal)
+    task = bar.add_task(what, total=None)
+
+    def update(done: int, total: int) -> None:
+        bar.start()  # once started, this does nothing
+        bar.update(task, completed=done, total=total)
+
+    try:
+        yield update
+    finally:
+        bar.stop()
 
 
 def report(result: dict[str, Any], table: Callable[[dict[str, Any]], Table], json_to: str | None) -> None:

@@ -31,6 +31,11 @@ class Archive(ABC):
         Array name to unit, as the file itself states it.
     rates_hz
         Array name to its sample rate [Hz], as the file itself states it.
+    starts_s
+        Array name to the instant of its first sample [s], as the file itself states it, from any common zero.
+    shares
+        Arrays of integers that are read as shares of a converter's full scale, -1 to 1: the file does not say how much
+        of what that is.
     """
 
     format = ""
@@ -40,6 +45,8 @@ class Archive(ABC):
         self.names: tuple[str, ...] = ()
         self.units: Mapping[str, str] = MappingProxyType({})
         self.rates_hz: Mapping[str, float] = MappingProxyType({})
+        self.starts_s: Mapping[str, float] = MappingProxyType({})
+        self.shares: frozenset[str] = frozenset()
 
     @abstractmethod
     def shape(self, name: str) -> tuple[int, ...]:
