@@ -10,6 +10,7 @@ Recording ends with an error, and whole, before the disk is full; a disk that fi
 """
 
 import json
+import threading
 import uuid
 import zlib
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel
@@ -267,6 +269,10 @@ class Recorder:
             )
 
     def _begin_part(self) -> None:
+        if self.part:
+            # Rerun keeps threads and memory of a finished stream until it is told; a viewer that has stalled may
+            # hold that up, so nobody waits for it.
+            threading.Thread(target=flush_and_cleanup_orphaned_recordings, daemon=True).start()
         self.part += 1
         self._first_sample = None
         self._file = part_path(self.path, self.part)
