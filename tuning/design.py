@@ -1,6 +1,7 @@
 """From a situation and what is asked of it to gains: start, search, tighten where the check grid sees more."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,11 +35,19 @@ FAILED = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """Gains as searched, not verified; what binds the law beside the physical limits, and the price of it."""
+    """Gains as searched, not verified; what binds the law beside the physical limits, and the price of it.
+
+    ``grid`` are the frequencies [Hz] the search looked at in the end.
+    """
 
     gains: Gains
     active: tuple[ActiveLimit, ...]
     found: Found
+    grid: Array | None
+
+
+def not_stopped() -> None:
+    """Let a search go on; in its place a function may be given that raises when nobody waits for it any more."""
 
 
 class Designer:
@@ -61,7 +70,15 @@ class Designer:
         self._program = GainProgram(self._scale, self._bounds)
 
     def design(
-        self, situation: Situation, cutoffs_hz: tuple[float, float], demands: Demands, wish_a: complex
+        self,
+        situation: Situation,
+        cutoffs_hz: tuple[float, float],
+        demands: Demands,
+        wish_a: complex,
+        *,
+        near: Array | None = None,
+        grid: Array | None = None,
+        go_on: Callable[[], None] = not_stopped,
     ) -> Design:
         """Gains with the least motion or, with a displacement asked for, the least power that reaches it.
 
@@ -69,16 +86,16 @@ class Designer:
         ----------
         wish_a
             Reference at the physical limit [A].
+        near, grid
+            Gains (3,) in SI units to start from and nowhere else, such as those of a slightly different question, and
+            the frequencies [Hz] that were looked at for them. Quick, but it may miss better gains farther off.
+        go_on
+            Called before each search; what it raises ends this.
         """
         if demands.displacement_m is not None:
-            return self._search(
-                situation,
-                cutoffs_hz,
-                demands,
-                wish_a,
-                "electrical" if demands.limits.electrical_mean_w < math.inf else "joule_mean",
-            )
-        return self._search(situation, cutoffs_hz, demands, wish_a, None)
+            kind: BudgetKind = "electrical" if demands.limits.electrical_mean_w < math.inf else "joule_mean"
+            return self._search(situation, cutoffs_hz, demands, wish_a, kind, near, grid, go_on)
+        return self._search(situation, cutoffs_hz, demands, wish_a, None, near, grid, go_on)
 
     def least_power(
         self,
@@ -87,10 +104,12 @@ class Designer:
         demands: Demands,
         wish_a: complex,
         kind: BudgetKind,
+        *,
+        go_on: Callable[[], None] = not_stopped,
     ) -> Gains | None:
         """Gains that keep everything but the power with the least of it; None if there are none."""
         free = replace(demands.limits, joule_mean_w=math.inf, electrical_mean_w=math.inf)
-        design = self._search(situation, cutoffs_hz, replace(demands, limits=free), wish_a, kind)
+        design = self._search(situation, cutoffs_hz, replace(demands, limits=free), wish_a, kind, go_on=go_on)
         return design.gains if design.found.violation < FAILED else None
 
     def _search(
@@ -100,13 +119,16 @@ class Designer:
         demands: Demands,
         wish_a: complex,
         kind: BudgetKind | None,
+        near: Array | None = None,
+        grid: Array | None = None,
+        go_on: Callable[[], None] = not_stopped,
     ) -> Design:
         conditions, unit = self._conditions(situation, cutoffs_hz, demands, kind)
         left = abs(situation.paths.motion[0] * wish_a + situation.paths.motion[1]) / unit
         enough = 0.0 if kind is not None else left**2 * (1.0 + 2.0 * NEXT_TO_LIMIT) + NEXT_TO_LIMIT**2
-        grid = situation.design_grid
+        grid = situation.design_grid if grid is None else grid
         margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
-        first: list[Array] | None = None
+        first: list[Array] | None = None if near is None else [near]
         for tightening in range(TIGHTENINGS):
             terms = situation.loop_terms(grid, cutoffs_hz)
             stability = self._stability(situation, grid, cutoffs_hz, demands, terms, margin, late)
@@ -114,7 +136,9 @@ class Designer:
             if first is None:
                 curves = [terms[0], *self._late(grid, terms[0], demands)]
                 first = self._starts(conditions[0], wish_a, curves, margin)
-            found = self._best(search, first, ITERATIONS if tightening == 0 else AGAIN)
+            found = self._best(
+                search, first, ITERATIONS if tightening == 0 and near is None else AGAIN, go_on
+            )
             alpha, beta, gamma = (float(x) for x in found.numbers)
             gains = Gains(alpha, beta, gamma, *cutoffs_hz)
             if found.violation > FAILED:
@@ -130,9 +154,8 @@ class Designer:
                 margin += (0.5 if tightening == 0 else 1.5) * short + 1e-5
             late += LATE_MARGIN if hasty else 0.0
             first = [found.numbers, *first] if hasty else [found.numbers]
-        return Design(
-            gains, _prices(found, conditions[0], gains, situation.paths, demands, unit, kind), found
-        )
+        active = _prices(found, conditions[0], gains, situation.paths, demands, unit, kind)
+        return Design(gains, active, found, grid)
 
     def _conditions(
         self, situation: Situation, cutoffs_hz: tuple[float, float], demands: Demands, kind: BudgetKind | None
@@ -199,9 +222,10 @@ class Designer:
         return found
 
     @staticmethod
-    def _best(search: GainSearch, first: list[Array], iterations: int) -> Found:
+    def _best(search: GainSearch, first: list[Array], iterations: int, go_on: Callable[[], None]) -> Found:
         best: Found | None = None
         for start in first:
+            go_on()
             if start is not first[-1] and not search.is_stable(start):
                 continue  # From an unstable loop a search rarely comes back.
             found = search.run(start, iterations)

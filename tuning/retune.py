@@ -7,9 +7,10 @@ keep all of it stay unless the new ones are better by more than a stated amount.
 
 import math
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from tuning.design import Designer
+from tuning.design import Design, Designer, not_stopped
 from tuning.limit import CoilLimits, LimitResult, least_power, physical_limit
 from tuning.loop import LoopFacts, Margins
 from tuning.steady import Prediction, SteadyPaths, predict
@@ -118,6 +119,8 @@ class Retuner:
         Sampling and delay of the rig's loop.
     goal
         Budget and margin.
+    designer
+        Of the same plant, shared between goals; None makes one.
 
     Raises
     ------
@@ -125,7 +128,9 @@ class Retuner:
         If the plant states no limit on the coil's current or stroke: without them nothing may be proposed.
     """
 
-    def __init__(self, plant: Plant, facts: LoopFacts, goal: TuningGoal) -> None:
+    def __init__(
+        self, plant: Plant, facts: LoopFacts, goal: TuningGoal, designer: Designer | None = None
+    ) -> None:
         _check(plant, goal)
         coil = plant.voice_coil
         if coil is None:
@@ -146,7 +151,7 @@ class Retuner:
             goal.slowest_decay_1_s,
             goal.displacement_m,
         )
-        self._designer = Designer(plant)
+        self._designer = Designer(plant) if designer is None else designer
         self._solved: dict[int, _Solved] = {}
 
     def propose(
@@ -190,7 +195,7 @@ class Retuner:
                 if known is not None and known.answers(question):
                     point = known.point
                 else:
-                    point = self._point(situation, in_use)
+                    point, _ = self._point(situation, in_use)
                     self._solved[row] = _Solved(question, point)
             except NoGainsError as error:
                 stays = self._in_use_without_better(situation, in_use)
@@ -214,6 +219,11 @@ class Retuner:
             points=tuple(points),
             refusals=tuple(refusals),
         )
+
+    @property
+    def designer(self) -> Designer:
+        """Of this plant; what it answers depends on nothing it was asked before."""
+        return self._designer
 
     @property
     def limits(self) -> CoilLimits:
@@ -252,9 +262,75 @@ class Retuner:
         NoGainsError
             If nothing may be proposed; it names what binds, and the least budget that would do.
         """
-        return self._point(self._situation(plant, damping_std_ns_m, frequency_hz, amplitude), in_use)
+        return self._point(self._situation(plant, damping_std_ns_m, frequency_hz, amplitude), in_use)[0]
 
-    def _point(self, situation: Situation, in_use: Gains) -> OperatingPoint:
+    def settle(
+        self,
+        situation: Situation,
+        in_use: Gains,
+        near: Sequence[Design] | None = None,
+        go_on: Callable[[], None] = not_stopped,
+    ) -> tuple[OperatingPoint, Design | None]:
+        """What `propose` proposes for one operating point, in a situation that is there already.
+
+        Parameters
+        ----------
+        situation
+            With the goal's drift.
+        in_use
+            Gains in use, behind the cutoffs that are meant.
+        near
+            Designs of questions that differ little, without a ``grid`` if they are of another situation: the first
+            whose neighbourhood has verified gains is taken, and nowhere else is searched. All that is stated is
+            verified; better gains farther off may be missed.
+        go_on
+            Called between searches; what it raises ends this.
+
+        Returns
+        -------
+        tuple
+            The point, and the design behind it; None where the gains in use stay because nothing was found.
+
+        Raises
+        ------
+        NoGainsError
+            If nothing may be proposed; with ``near`` only: if nothing is known yet.
+        """
+        try:
+            if near is None:
+                point, design = self._point(situation, in_use, go_on)
+            else:
+                point, design = self._nearby(situation, in_use, near, go_on)
+        except NoGainsError:
+            stays = self._in_use_without_better(situation, in_use)
+            if stays is None:
+                raise
+            return stays, None
+        return self._or_in_use(situation, in_use, point), design
+
+    def _nearby(
+        self, situation: Situation, in_use: Gains, near: Sequence[Design], go_on: Callable[[], None]
+    ) -> tuple[OperatingPoint, Design]:
+        try:
+            best = physical_limit(situation.paths, self._limits)
+        except RunError as error:
+            raise NoGainsError(str(error), ()) from error
+        cutoffs, trouble = (in_use.low_pass_hz, in_use.high_pass_hz), "not worked out yet"
+        for known in near:
+            design = self._designer.design(
+                situation, cutoffs, self._demands, best.reference_a,
+                near=known.found.numbers, grid=known.grid, go_on=go_on,
+            )  # fmt: skip
+            verdict = verify(situation, design.gains, self._demands)
+            if not verdict.trouble:
+                active = (*best.active, *design.active)
+                return self._describe(situation, design.gains, best, verdict, active, kept=False), design
+            trouble = verdict.trouble
+        raise NoGainsError(trouble, ())
+
+    def _point(
+        self, situation: Situation, in_use: Gains, go_on: Callable[[], None] = not_stopped
+    ) -> tuple[OperatingPoint, Design]:
         try:
             best = physical_limit(situation.paths, self._limits)
         except RunError as error:
@@ -268,12 +344,12 @@ class Retuner:
             raise self._unsolved(
                 situation, cutoffs, best, Verdict(reason, "displacement", Margins(0.0, None), 0.0, ()), names
             )
-        design = self._designer.design(situation, cutoffs, self._demands, best.reference_a)
+        design = self._designer.design(situation, cutoffs, self._demands, best.reference_a, go_on=go_on)
         verdict = verify(situation, design.gains, self._demands)
         if verdict.trouble:
-            raise self._unsolved(situation, cutoffs, best, verdict)
+            raise self._unsolved(situation, cutoffs, best, verdict, go_on=go_on)
         active = (*best.active, *design.active)
-        return self._describe(situation, design.gains, best, verdict, active, kept=False)
+        return self._describe(situation, design.gains, best, verdict, active, kept=False), design
 
     def _situation(self, plant: Plant, std: float, frequency: float, amplitude: float) -> Situation:
         return Situation(plant, self.facts, frequency, amplitude, std, self.goal.drift_hz)
@@ -369,12 +445,13 @@ class Retuner:
         best: LimitResult,
         verdict: Verdict,
         binding: tuple[str, ...] = (),
+        go_on: Callable[[], None] = not_stopped,
     ) -> NoGainsError:
         """No gains of the law keep everything: say what binds, and the least budget with which some do."""
         if verdict.broken not in ("power", "electrical", "displacement", "stroke", "current", "voltage"):
             return NoGainsError(verdict.trouble, (verdict.broken,))
         frugal = self._designer.least_power(
-            situation, cutoffs, self._demands, best.reference_a, self.goal.budget_kind
+            situation, cutoffs, self._demands, best.reference_a, self.goal.budget_kind, go_on=go_on
         )
         needed: float | None = None
         if frugal is not None:

@@ -7,6 +7,7 @@ excitation and beside it, at the damping and two standard deviations off.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,11 +18,15 @@ from twin.control.schedule import Gains
 from twin.plant.config import Plant
 from twin.plant.linear import Array, ComplexArray
 
+Found = TypeVar("Found")
+
 ROUNDING = 1e-9
 CHECK_POINTS = 150
 DESIGN_POINTS = 40
 DELAYS = (0.5, 1.0)
 VALLEYS, BETWEEN = 3, np.linspace(0.0, 1.0, 41)
+KEPT_FINDINGS = 100
+"""Sets of gains whose poles and margins a situation remembers."""
 
 
 class Situation:
@@ -55,6 +60,10 @@ class Situation:
         self.facts, self.frequency_hz, self.amplitude = facts, frequency_hz, amplitude
         self.damping_std_ns_m = damping_std_ns_m
         self._chains: dict[str, tuple[tuple[float, float], ComplexArray]] = {}
+        self._terms: tuple[Array, tuple[float, float], list[ComplexArray]] | None = None
+        # What does not depend on the excitation's size, and is asked again of the same gains.
+        self._decays: dict[Gains, tuple[float, ...]] = {}
+        self._margins: dict[Gains, Margins] = {}
         self.models = [RigModel(plant, facts, frequency_hz, c) for c in dampings]
         nominal = self.models[0]
         beside = [frequency_hz - drift_hz, frequency_hz + drift_hz] if drift_hz > 0.0 else []
@@ -87,8 +96,12 @@ class Situation:
 
     def loop_terms(self, grid: Array, cutoffs_hz: tuple[float, float]) -> list[ComplexArray]:
         """Loop gain per unit of each gain on a grid [Hz], one (n, 3) per model."""
-        chain = self._chain(grid, cutoffs_hz)
-        return [-m.acceleration(grid)[:, None] * chain for m in self.models]
+        known = self._terms
+        if known is None or known[0] is not grid or known[1] != cutoffs_hz:
+            chain = self._chain(grid, cutoffs_hz)
+            terms = [-m.acceleration(grid)[:, None] * chain for m in self.models]
+            known = self._terms = grid, cutoffs_hz, terms
+        return known[2]
 
     def laws(self, cutoffs_hz: tuple[float, float]) -> ComplexArray:
         """Reference per measured acceleration and unit of each gain, (cases, 3)."""
@@ -115,7 +128,8 @@ class Situation:
 
     def margins(self, gains: Gains) -> Margins:
         """The least margins of all models."""
-        return self.margins_and_valleys(gains, 0.0)[0]
+        known = self._margins.get(gains)
+        return self.margins_and_valleys(gains, 0.0)[0] if known is None else known
 
     def margins_and_valleys(self, gains: Gains, below: float) -> tuple[Margins, Array]:
         """The least margins of all models, and where |1 + L| has its deepest bottoms below some distance [Hz].
@@ -146,11 +160,21 @@ class Situation:
             distance = distance.reshape(between.shape)
             at = np.argmin(distance, axis=0), np.arange(between.shape[1])
             bottoms.append(between[at][distance[at] < below])
-        return Margins(modulus, delay if delay < math.inf else None), np.unique(np.concatenate(bottoms))
+        least = Margins(modulus, delay if delay < math.inf else None)
+        _remember(self._margins, gains, least)
+        return least, np.unique(np.concatenate(bottoms))
 
     def decay_rate_1_s(self, gains: Gains) -> float:
         """Slowest decay of all models [1/s]; below 0 is stable."""
-        return max(m.decay_rate_1_s(gains) for m in self.models)
+        return max(self.decay_rates_1_s(gains))
+
+    def decay_rates_1_s(self, gains: Gains) -> tuple[float, ...]:
+        """Slowest decay of each model [1/s], the nominal one first."""
+        known = self._decays.get(gains)
+        if known is None:
+            known = tuple(m.decay_rate_1_s(gains) for m in self.models)
+            _remember(self._decays, gains, known)
+        return known
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +207,12 @@ class Verdict:
     margins: Margins
     decay_rate_1_s: float
     predictions: tuple[Prediction, ...]
+
+
+def _remember(known: dict[Gains, Found], gains: Gains, found: Found) -> None:
+    if len(known) >= KEPT_FINDINGS:
+        known.pop(next(iter(known)))
+    known[gains] = found
 
 
 def _numbers(gains: Gains) -> Array:
