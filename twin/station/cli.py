@@ -16,8 +16,10 @@ from twin.station.campaign.command import campaign
 from twin.station.confirm import WriteSidecarOption, YesOption, accept_recording
 from twin.station.fit import fit_app
 from twin.station.library import recordings_app
+from twin.station.report.command import report as file_report
 from twin.station.terminal import (
     JsonOption,
+    channel_options,
     must_be_writable,
     number,
     people,
@@ -45,6 +47,10 @@ app.command(
     epilog="Examples: atmd campaign docs/examples/campaign.toml   ·   "
     "atmd campaign docs/examples/campaign.toml --replay 17"
 )(campaign)
+app.command(
+    "report",
+    epilog="Examples: atmd report runs/demo.rrd   ·   atmd report runs/demo.rrd --plot demo.pdf --json -",
+)(file_report)
 
 
 class ControllerName(StrEnum):
@@ -327,7 +333,7 @@ def replay(
         raise InputError(f"--from {from_s:g} --to {to_s:g}: there is nothing between; give a later end, in s")
     options = ReplayOptions(
         plant=plant,
-        channels=_channel_options(channel or []),
+        channels=channel_options(channel or []),
         sample_rate_hz=sample_rate,
         sidecar=sidecar,
         recording=save,
@@ -955,16 +961,6 @@ def _replay_table(r: dict[str, Any]) -> Table:
         )
     table.add_row("real-time factor", number(r["realtime_factor"]), "time of data / time in the loop")
     return table
-
-
-def _channel_options(options: list[str]) -> dict[str, str]:
-    pairs = {}
-    for option in options:
-        name, equals, array = option.partition("=")
-        if not (name and equals and array):
-            raise InputError(f"--channel {option}: write NAME=ARRAY:UNIT, such as tip_displacement=y:mm")
-        pairs[name] = array
-    return pairs
 
 
 def _two_hz(option: str, text: str) -> tuple[float, float]:

@@ -71,6 +71,17 @@ def must_be_writable(json_to: str | None) -> None:
         )
 
 
+def channel_options(options: list[str]) -> dict[str, str]:
+    """Read ``--channel NAME=ARRAY:UNIT`` options; raises InputError for another form."""
+    pairs = {}
+    for option in options:
+        name, equals, array = option.partition("=")
+        if not (name and equals and array):
+            raise InputError(f"--channel {option}: write NAME=ARRAY:UNIT, such as tip_displacement=y:mm")
+        pairs[name] = array
+    return pairs
+
+
 def percent(share: float | None) -> str:
     """Share in percent, or a dash."""
     return "-" if share is None else f"{100.0 * share:.1f} %"
