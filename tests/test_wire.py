@@ -436,8 +436,8 @@ def test_rig_that_starts_again_goes_on_in_the_same_count_of_samples(false_rig: F
     gateway = false_rig.gateway
     false_rig.send(0, rows(100))
     false_rig.samples.send_multipart([TOPIC_HELLO, encode(HELLO | {"run_id": "b", "waits_for_start": True})])
-    false_rig.send(100, rows(100), run_id="a")  # a straggler of the run that is over
     false_rig.send(0, rows(100), run_id="b", sequence=0)
+    false_rig.send(100, rows(100), run_id="a")  # a straggler of the run that is over
     false_rig.samples.send_multipart([TOPIC_END, encode({"next_sample": 100})])
     blocks = list(gateway.blocks())
     starts = [b.first_sample for b in blocks]
@@ -464,6 +464,7 @@ def test_rig_that_comes_back_as_another_ends_the_run_with_words(
 ) -> None:
     false_rig.send(0, rows(100))
     false_rig.samples.send_multipart([TOPIC_HELLO, encode(HELLO | {"run_id": "b"} | changes)])
+    false_rig.send(0, rows(100), run_id="b", sequence=0)
     blocks = false_rig.gateway.blocks()
     assert next(blocks).first_sample == 0
     with pytest.raises(RunError, match=f"came back with another {next(iter(changes))}"):
