@@ -20,6 +20,9 @@ LATELY_S = 60.0
 """Trouble on the wire is worth a mark for so long; the counts stay."""
 
 STATION_LOST = "station lost: control off"
+STATION_LOST_WORDS = (
+    "the rig was without a station and has switched its control off; Control on lets it act again"
+)
 
 TIGHT_SHARE = 0.7
 """A loop that needs more of a block's time than this is near its end."""
@@ -133,6 +136,8 @@ class Panel:
             "sent": self._sent,
             "audit": None if self._audit is None else audit_figures(self._audit),
             "alarms": self._alarms(frame, load, wire, goal),
+            # At every start the rig has been without a station for a while: no alarm, but to be known.
+            "notices": [STATION_LOST_WORDS] if wire.notice == STATION_LOST else [],
         }
 
     def _wire(self, wire: WireState, now_s: float) -> dict[str, Any]:
@@ -176,9 +181,8 @@ class Panel:
 
     def _alarms(self, frame: Frame, load: float, wire: WireState, goal: TuningGoal) -> list[str]:
         found = []
-        if wire.notice:
-            remedy = " Press Control on when all is well." if wire.notice == STATION_LOST else ""
-            found.append(f"Rig: {wire.notice}.{remedy}")
+        if wire.notice and wire.notice != STATION_LOST:
+            found.append(f"Rig: {wire.notice}")
         if frame.health.verdict in ("diverged", "no data"):
             found.append(f"Model {frame.health.verdict}: {frame.health.reason}")
         if load > TIGHT_SHARE:

@@ -61,10 +61,10 @@ export function showNow(state) {
   now = p && p.displacement_m !== null ? { f: state.excitation_hz, x: p.displacement_m, p: p.power_w } : null;
 }
 
-export function drawBranch(b, measured) {
+export function drawBranch(b, measured, passive) {
   const t = b.traces[0].displacement_m.map((_, k) => 1e3 * b.step_s * (k + 1));
   const kinds = { passive: "passive", "in use": "use", proposed: "new" };
-  const traces = b.traces.map((r) => ({ ...line(kinds[r.name], t, r.displacement_m.map((v) => 1e6 * v)), mode: "lines" }));
+  const traces = b.traces.filter((r) => passive || r.name !== "passive").map((r) => ({ ...line(kinds[r.name], t, r.displacement_m.map((v) => 1e6 * v)), mode: "lines" }));
   const used = b.traces.find((r) => r.name === "in use");
   if (used) {
     const up = used.displacement_m.map((v, k) => 1e6 * (v + used.displacement_std_m[k])), down = used.displacement_m.map((v, k) => 1e6 * (v - used.displacement_std_m[k]));
