@@ -33,7 +33,7 @@ WHAT = {
 STAGES = {
     "plant in parallel": "_parallel.advance",
     "observer": "observer.advance",
-    "lock-in": "_tracker.advance",
+    "lock-in": "_identification.tracker.advance",
     "damping": "_learn",
     "model refresh": "_refresh_model",
     "retuning": "_retune",
@@ -170,7 +170,9 @@ def _watch(session: Session) -> dict[str, float]:
 
     for name, path in STAGES.items():
         *owner, method = path.split(".")
-        target = getattr(session, owner[0]) if owner else session
+        target: Any = session
+        for part in owner:
+            target = getattr(target, part)
         setattr(target, method, timed(name, getattr(target, method)))
     return total
 

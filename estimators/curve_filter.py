@@ -35,6 +35,7 @@ class CurveFilter:
         self._covariance = basis.prior(prior_std, length_hz)
         self._prior_variance = self._spread(self._covariance)
         self._per_delay = np.zeros((basis.size, DELAYS))
+        self._seen: tuple[float, Array] = (math.nan, np.zeros(basis.size))
 
     @property
     def values(self) -> Array:
@@ -49,7 +50,7 @@ class CurveFilter:
     def std(self, delay_std_s: float) -> Array:
         """(n_knots,) standard deviation, with delays doubted by so much."""
         late = self._per_delay if self._is_knots else self._at_knots @ self._per_delay
-        variance: Array = self._spread(self._covariance) + np.sum(late**2, axis=1) * delay_std_s**2
+        variance: Array = self._spread(self._covariance) + np.einsum("kd,kd->k", late, late) * delay_std_s**2
         return np.sqrt(variance)
 
     @property
@@ -59,21 +60,27 @@ class CurveFilter:
 
     def at(self, frequency_hz: float) -> float:
         """Curve at a frequency."""
-        return float(self.basis.weights(frequency_hz) @ self._mean)
+        return float(self._weights(frequency_hz) @ self._mean)
+
+    def _weights(self, frequency_hz: float) -> Array:
+        """The basis's weights, remembered for the frequency last asked for: a block asks several times."""
+        if self._seen[0] != frequency_hz:
+            self._seen = frequency_hz, self.basis.weights(frequency_hz)
+        return self._seen[1]
 
     def std_at(self, frequency_hz: float, delay_std_s: float) -> float:
         """Standard deviation at a frequency, with delays doubted by so much."""
-        h = self.basis.weights(frequency_hz)
-        late = float(np.sum((h @ self._per_delay) ** 2)) * delay_std_s**2
-        return math.sqrt(max(float(h @ self._covariance @ h), 0.0) + late)
+        h = self._weights(frequency_hz)
+        late = h @ self._per_delay
+        return math.sqrt(max(float(h @ self._covariance @ h), 0.0) + float(late @ late) * delay_std_s**2)
 
     def surprise(
         self, frequency_hz: float, value: float, variance: float, per_delay: Array, delay: float
     ) -> float:
         """Distance of a reading from the curve in the standard deviations it should have."""
-        h = self.basis.weights(frequency_hz)
-        late = float(np.sum((per_delay - h @ self._per_delay) ** 2)) * delay**2
-        s = max(float(h @ self._covariance @ h), 0.0) + variance + late
+        h = self._weights(frequency_hz)
+        late = per_delay - h @ self._per_delay
+        s = max(float(h @ self._covariance @ h), 0.0) + variance + float(late @ late) * delay**2
         return (value - float(h @ self._mean)) / math.sqrt(s)
 
     def take(self, frequency_hz: float, value: float, variance: float, per_delay: Array) -> None:
@@ -86,16 +93,18 @@ class CurveFilter:
         per_delay
             (3,) what a second of each delay would add to it.
         """
-        h = self.basis.weights(frequency_hz)
+        h = self._weights(frequency_hz)
         P = self._covariance
+        late_before = h @ self._per_delay
         g = P @ h
         gain = g / (float(h @ g) + variance)
-        self._per_delay += np.outer(gain, per_delay - h @ self._per_delay)
+        self._per_delay += gain[:, None] * (per_delay - late_before)
         if self.basis.size == 3:
             rls3_block(self._mean, P, h[None, :], np.array([value]), np.array([variance]), 1.0)
         else:
-            scalar_update(self._mean, P, h, variance, value)
-        self._covariance = 0.5 * (P + P.T)
+            scalar_update(
+                self._mean, P, h, variance, value
+            )  # leaves what was symmetric symmetric, to the bit
 
     def forget(self, frequency_hz: float, variance: float) -> None:
         """Let the curve be less certain at a frequency, up to where it started."""
@@ -141,12 +150,13 @@ class CurveFilter:
             raise ValueError("the covariance is not symmetric")
         if float(np.linalg.eigvalsh(covariance).min()) < -1e-9 * scale:
             raise ValueError("the covariance has a negative variance")
-        self._mean, self._covariance, self._per_delay = mean, covariance, per_delay
+        self._mean, self._per_delay = mean, per_delay
+        self._covariance = 0.5 * (covariance + covariance.T)
 
     def _spread(self, covariance: Array) -> Array:
         """(n_knots,) variance of the curve."""
         if self._is_knots:
-            return np.maximum(np.diag(covariance), 0.0)
+            return np.maximum(covariance.diagonal(), 0.0)
         rows = self._at_knots
         variance: Array = np.einsum("ki,ij,kj->k", rows, covariance, rows)
         return np.maximum(variance, 0.0)

@@ -125,6 +125,10 @@ class DampingLearner:
             STIFFNESS_LENGTH_HZ,
         )
         self._in_use = np.maximum(self._damping.values, 0.0)
+        wanted = (self._knots >= settings.wanted_from_hz) & (self._knots <= settings.wanted_to_hz)
+        self._wanted = np.flatnonzero(wanted)
+        self._knots_hz = tuple(self._knots.tolist())
+        self._table: DampingTable | None = None
         self._accepted = self._strays = 0
         self._last_hz = math.nan
         self._misfit = 1.0
@@ -154,7 +158,10 @@ class DampingLearner:
             self._take(balance, elapsed_s)
         step = self.settings.rate_limit_ns_m_s * elapsed_s
         wanted = np.maximum(self._damping.values, 0.0)
-        self._in_use += np.clip(wanted - self._in_use, -step, step)
+        before = self._in_use
+        self._in_use = before + np.minimum(np.maximum(wanted - before, -step), step)
+        if not np.array_equal(before, self._in_use):
+            self._table = None
         return self.curve()
 
     def warm_up(self) -> None:
@@ -168,7 +175,7 @@ class DampingLearner:
         stiffness, stiffness_std = self._stiffness.values, self._stiffness_std()
         here = self._last_hz if self._accepted else 0.0
         return DampingCurve(
-            frequency_hz=read_only(self._knots),
+            frequency_hz=self._knots,
             damping_ns_m=read_only(self._damping.values),
             std_ns_m=read_only(std),
             noise_std_ns_m=read_only(self._damping.noise_std),
@@ -186,10 +193,14 @@ class DampingLearner:
         )
 
     def table(self) -> DampingTable:
-        """Return the curve in use, as a plant takes it."""
-        return DampingTable(
-            frequency_hz=tuple(float(f) for f in self._knots), ns_m=tuple(float(c) for c in self._in_use)
-        )
+        """Return the curve in use, as a plant takes it; the same object until it moves."""
+        if self._table is None:
+            self._table = DampingTable(frequency_hz=self._knots_hz, ns_m=tuple(self._in_use.tolist()))
+        return self._table
+
+    def in_use_at(self, frequency_hz: float) -> float:
+        """Damping in use at a frequency [Ns/m], as `table` has it."""
+        return float(np.interp(frequency_hz, self._knots, self._in_use))
 
     def std_at(self, frequency_hz: float) -> float:
         """Standard deviation of the learned value at a frequency [Ns/m]."""
@@ -225,7 +236,7 @@ class DampingLearner:
         in_use = np.array(state["in_use_ns_m"], dtype=np.float64)
         if in_use.shape != learner._knots.shape or not np.all(in_use >= 0.0) or not np.isfinite(in_use).all():
             raise ValueError("in_use_ns_m must hold one finite damping of at least 0 Ns/m per knot")
-        learner._in_use = in_use
+        learner._in_use, learner._table = in_use, None
         learner._accepted, learner._last_hz = int(state["blocks"]), float(state["last_hz"])
         if learner._accepted < 0 or not math.isfinite(learner._last_hz):
             raise ValueError("blocks and last_hz must be finite and not below 0")
@@ -238,11 +249,11 @@ class DampingLearner:
     def _progress(self, std: Array) -> float:
         """0 where the prior stands to 1 where the wanted band is known as well as wanted, in decades of std."""
         s = self.settings
-        inside = (self._knots >= s.wanted_from_hz) & (self._knots <= s.wanted_to_hz)
-        if not inside.any() or s.wanted_std_ns_m >= s.prior_std_ns_m:
+        if not len(self._wanted) or s.wanted_std_ns_m >= s.prior_std_ns_m:
             return 1.0
-        share = np.log(s.prior_std_ns_m / np.maximum(std[inside], s.wanted_std_ns_m))
-        return float(np.clip(np.mean(share) / math.log(s.prior_std_ns_m / s.wanted_std_ns_m), 0.0, 1.0))
+        share = np.log(s.prior_std_ns_m / np.maximum(std[self._wanted], s.wanted_std_ns_m))
+        progress = float(share.mean()) / math.log(s.prior_std_ns_m / s.wanted_std_ns_m)
+        return min(max(progress, 0.0), 1.0)
 
     def _status(self) -> DampingStatus:
         if not np.all(np.isfinite(self._damping.values)):

@@ -13,10 +13,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.balance_noise import BalanceNoise
 from estimators.moments import MOST_DERIVATIVES, moments
 from estimators.types import Phasors
+from twin.plant.compiled import kernel
 from twin.plant.config import MOTION_UNITS, Plant
 from twin.plant.linear import Array, ComplexArray, read_only
 
@@ -90,38 +92,53 @@ class AbsorberBalance:
         sensors = {s.name: s for s in plant.sensor}
         self._stages = [sensors[channels[column]].input_stage for column in self._columns]
         self._has_stages = any(stage(1j) != 1.0 for stage in self._stages)
+        self._signs = (-1.0) ** self._orders
+        self._shares: dict[bytes, Array | None] = {}
 
     def solve(self, phasors: Phasors) -> ForceBalance:
         """Damping and stiffness of one block."""
         w = math.tau * phasors.frequency_hz
         variance = phasors.sample_variance[self._columns]
-        share = _weighted(self._geometry, w ** (2.0 * self._orders) * variance[:-1])
+        share = self._share(w ** (2.0 * self._orders) * variance[:-1])
         if share is None or not math.isfinite(variance[-1]):
             return _nothing(phasors)
         tests = self._tests(phasors, share)
-        of_stiffness, of_damping, force = (complex(part) for part in tests[0].terms)
-        matrix = np.array([[of_stiffness.real, of_damping.real], [of_stiffness.imag, of_damping.imag]])
-        if not abs(np.linalg.det(matrix)) > 1e-12 * abs(of_stiffness) * abs(of_damping):
+        of_stiffness, of_damping, force = tests.terms
+        determinant = of_stiffness.real * of_damping.imag - of_stiffness.imag * of_damping.real
+        if not abs(determinant) > 1e-12 * abs(of_stiffness) * abs(of_damping):
             return _nothing(phasors)
-        inverse = np.linalg.inv(matrix)
-        stiffness, damping = (float(v) for v in inverse @ [force.real, force.imag])
+        inverse = (
+            np.array([[of_damping.imag, -of_damping.real], [-of_stiffness.imag, of_stiffness.real]])
+            / determinant
+        )
+        stiffness, damping = (inverse @ (force.real, force.imag)).tolist()
         std = math.sqrt(0.5 * self._noise(tests, stiffness, damping))
-        late = -1j * w * tests[0].bodies_and_coil(stiffness, damping)
+        late = -1j * w * tests.bodies_and_coil(stiffness, damping)
         per_delay = inverse @ np.array([late.real, late.imag])
         relative = self._relative(phasors, share)
         return ForceBalance(
             frequency_hz=phasors.frequency_hz,
             damping_ns_m=damping,
-            damping_std_ns_m=std * float(np.linalg.norm(inverse[1])),
+            damping_std_ns_m=std * math.hypot(*inverse[1].tolist()),
             stiffness_n_m=stiffness,
-            stiffness_std_n_m=std * float(np.linalg.norm(inverse[0])),
+            stiffness_std_n_m=std * math.hypot(*inverse[0].tolist()),
             transient_1_s=relative,
             damping_per_delay_ns_m_s=read_only(per_delay[1]),
             stiffness_per_delay_n_m_s=read_only(per_delay[0]),
             steady=phasors.steady,
         )
 
-    def _tests(self, phasors: Phasors, share: Array) -> list["_Test"]:
+    def _share(self, variance: Array) -> Array | None:
+        """`_weighted`, remembered where only which motions are seen decides."""
+        seen = np.isfinite(variance)
+        if np.count_nonzero(seen) > 2:
+            return _weighted(self._geometry, variance)
+        key = seen.tobytes()
+        if key not in self._shares:
+            self._shares[key] = _weighted(self._geometry, variance)
+        return self._shares[key]
+
+    def _tests(self, phasors: Phasors, share: Array) -> "_Tests":
         """The balance against each test function of a block."""
         highest = 2 + int(self._orders.max())
         found = moments(
@@ -130,27 +147,24 @@ class AbsorberBalance:
             phasors.frequency_hz,
             min(highest + self._has_stages, MOST_DERIVATIVES),
         )
-        full, grams = found.against_derivatives, found.gram
+        full = found.against_derivatives
         if self._has_stages:
             full = self._before_input_stages(full, math.tau * found.frequency_hz)
         # <a, psi^(m)> = (-1)^n <y, psi^(m+n)> for y that lacks n derivatives, m = 0, 1, 2.
         rows, motions = np.arange(3)[:, None] + self._orders, np.arange(len(self._orders))
-        accelerations = ((-1.0) ** self._orders * full[:, rows, motions]) @ share.T
+        accelerations = (self._signs * full[:, rows, motions]) @ share.T
         # In a channel's own residual common motion would count as noise: that of its sensor is the measure.
         variance = self._noise_density**2 * (0.5 * len(phasors.samples) / phasors.duration_s)
-        return [
-            _Test(
-                accelerations=accelerations[k],
-                coil_force=self.force_constant_n_a * complex(full[k, 2, -1]),
-                mass_kg=self.mass_kg,
-                share=share,
-                orders=self._orders,
-                gram=grams[k],
-                motion_variance=variance[:-1],
-                force_variance=self.force_constant_n_a**2 * float(variance[-1]),
-            )
-            for k in range(len(full))
-        ]
+        return _Tests(
+            accelerations=accelerations,
+            coil_force=self.force_constant_n_a * full[:, 2, -1],
+            mass_kg=self.mass_kg,
+            share=share,
+            orders=self._orders,
+            gram=found.gram,
+            motion_variance=variance[:-1],
+            force_variance=self.force_constant_n_a**2 * float(variance[-1]),
+        )
 
     def _before_input_stages(self, full: ComplexArray, w: Array) -> ComplexArray:
         """Moments of what the sensors felt, from those of what was recorded behind their input stages.
@@ -179,59 +193,99 @@ class AbsorberBalance:
         drift = abs(complex(difference @ phasors.slope[self._columns[:-1]]))
         return drift / size if size > 0.0 else math.inf
 
-    def _noise(self, tests: list["_Test"], stiffness: float, damping: float) -> float:
+    def _noise(self, tests: "_Tests", stiffness: float, damping: float) -> float:
         """E|error|² of the balance at the excitation, the first of the tests; the others are beside it."""
-        excess = 1.0
-        if len(tests) > 1:
-            shares = np.array([test.noise_shares(stiffness, damping) for test in tests[1:]])
-            powers = np.array([test.error_power(stiffness, damping) for test in tests[1:]])
-            excess = self._balance_noise.take(shares, powers)
-        return excess * float(tests[0].noise_shares(stiffness, damping) @ self._balance_noise.factors)
+        shares, powers = tests.errors(stiffness, damping)
+        excess = self._balance_noise.take(shares[1:], powers[1:]) if len(powers) > 1 else 1.0
+        return excess * float(shares[0] @ self._balance_noise.factors)
 
 
 @dataclass(frozen=True, slots=True)
-class _Test:
-    """``k2 <a_r, psi> - c2 <a_r, psi'> = <f_act - m2 a2, psi''>`` for one test function."""
+class _Tests:
+    """``k2 <a_r, psi> - c2 <a_r, psi'> = <f_act - m2 a2, psi''>`` for K test functions, the excitation's first."""
 
     accelerations: ComplexArray
-    """(3, 2) <a, psi^(m)> of both bodies."""
-    coil_force: complex
-    """<f_act, psi''>."""
+    """(K, 3, 2) <a, psi^(m)> of both bodies."""
+    coil_force: ComplexArray
+    """(K,) <f_act, psi''>."""
     mass_kg: float
     share: Array
-    orders: Array
+    orders: NDArray[np.int64]
     gram: ComplexArray
     motion_variance: Array
     force_variance: float
 
     @property
     def terms(self) -> tuple[complex, complex, complex]:
-        """What stands beside the stiffness, beside the damping, and on the other side."""
-        relative = self.accelerations[:, 1] - self.accelerations[:, 0]
-        return relative[0], -relative[1], self.coil_force - self.mass_kg * self.accelerations[2, 1]
-
-    def error_power(self, stiffness: float, damping: float) -> float:
-        """|error|² of the equation."""
-        return float(abs(complex(self.bodies_and_coil(stiffness, damping).sum())) ** 2)
+        """What stands beside the stiffness, beside the damping, and on the other side, at the excitation."""
+        (x0, y0), (x1, y1), (_, y2) = self.accelerations[0].tolist()
+        return y0 - x0, x1 - y1, complex(self.coil_force[0]) - self.mass_kg * y2
 
     def bodies_and_coil(self, stiffness: float, damping: float) -> ComplexArray:
-        """(3,) what the first body's motion, the second's and the coil's force add to the error."""
-        a = self.accelerations
-        dynamic = stiffness * a[0] - damping * a[1]
-        return np.array([dynamic[0], -dynamic[1] - self.mass_kg * a[2, 1], self.coil_force])
+        """(3,) what the first body's motion, the second's and the coil's force add to the error at the excitation."""
+        (x0, y0), (x1, y1), (_, y2) = self.accelerations[0].tolist()
+        first, second = stiffness * x0 - damping * x1, stiffness * y0 - damping * y1
+        return np.array([first, -second - self.mass_kg * y2, self.coil_force[0]])
 
-    def noise_shares(self, stiffness: float, damping: float) -> Array:
-        """(n + 1,) E|error|² from the stated noise of each motion and of the current."""
+    def errors(self, stiffness: float, damping: float) -> tuple[Array, Array]:
+        """(K, n + 1) E|error|² by the stated noise of each motion and of the current, and (K,) |error|² itself."""
+        K, n = len(self.coil_force), len(self.orders)
+        shares, powers = np.zeros((K, n + 1)), np.empty(K)
         bodies = np.array([[stiffness, -damping, 0.0], [-stiffness, damping, -self.mass_kg]])
-        of_channels = self.share.T @ bodies  # (n, 3) of psi, psi', psi''
-        shares = np.zeros(len(self.orders) + 1)
-        for c, n in enumerate(self.orders):
-            weights = of_channels[c]
-            if weights.any():
-                power = (weights @ self.gram[n : n + 3, n : n + 3] @ weights).real
-                shares[c] = power * self.motion_variance[c]
-        shares[-1] = self.force_variance * self.gram[2, 2].real
-        return shares
+        errors_of_tests(
+            self.accelerations, self.coil_force, self.gram, bodies, self.share, self.orders, self.motion_variance,
+            self.force_variance, shares, powers,
+        )  # fmt: skip
+        return shares, powers
+
+
+@kernel
+def errors_of_tests(
+    accelerations: ComplexArray,
+    coil_force: ComplexArray,
+    gram: ComplexArray,
+    bodies: Array,
+    share: Array,
+    orders: NDArray[np.int64],
+    motion_variance: Array,
+    force_variance: float,
+    shares: Array,
+    powers: Array,
+) -> None:
+    """Power of the balance's error against each test function, and what noise would give it, in place.
+
+    Parameters
+    ----------
+    accelerations, coil_force, gram
+        (K, 3, 2), (K,) and (K, d + 1, d + 1), see `_Tests` and `estimators.moments`.
+    bodies
+        (2, 3) what each body's <a, psi>, <a, psi'> and <a, psi''> add to the error.
+    share
+        (2, n) weights that make two bodies' accelerations of n measured motions.
+    orders
+        (n,) derivatives that each motion lacks to be an acceleration.
+    motion_variance, force_variance
+        (n,) of one sample of each motion, and of the coil's force.
+    shares, powers
+        (K, n + 1) and (K,), receive the results.
+    """
+    n = len(orders)
+    weights = np.zeros((n, 3))
+    for c in range(n):
+        for m in range(3):
+            weights[c, m] = share[0, c] * bodies[0, m] + share[1, c] * bodies[1, m]
+    for k in range(len(coil_force)):
+        error = coil_force[k]
+        for m in range(3):
+            error += bodies[0, m] * accelerations[k, m, 0] + bodies[1, m] * accelerations[k, m, 1]
+        powers[k] = error.real * error.real + error.imag * error.imag
+        for c in range(n):
+            power, at = 0.0, orders[c]
+            for m in range(3):
+                for q in range(3):
+                    power += weights[c, m] * weights[c, q] * gram[k, at + m, at + q].real
+            shares[k, c] = power * motion_variance[c]
+        shares[k, n] = force_variance * gram[k, 2, 2].real
 
 
 def _nothing(phasors: Phasors) -> ForceBalance:

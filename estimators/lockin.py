@@ -8,6 +8,7 @@ residual's own phasors a few hertz beside it: a white residual is no assumption.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,14 +197,26 @@ def _basis(phase: Array, u: Array, orders: tuple[int, ...]) -> Array:
     return basis
 
 
+@lru_cache(maxsize=4)
+def _turning_by(steps: tuple[int, ...], turns: bytes) -> ComplexArray:
+    """(n_steps, N) ``exp(-2j pi step turns)``: the same from block to block."""
+    powers = [np.exp(-2j * math.pi * np.frombuffer(turns))]
+    for _ in range(max(steps) - 1):
+        powers.append(powers[-1] * powers[0])
+    found = np.stack([powers[s - 1] if s > 0 else np.conj(powers[-s - 1]) for s in steps])
+    found.flags.writeable = False
+    return found
+
+
 def _inverse(gram: Array) -> Array:
     """Inverse of a Gram matrix; the pseudoinverse where its columns cannot be told apart."""
     factor, failed = lapack.dpotrf(gram, lower=0)
     if not failed:
         upper, failed = lapack.dpotri(factor, lower=0)
         if not failed:
-            triangle = np.triu(upper)
-            return np.asarray(triangle + triangle.T - np.diag(np.diag(upper)))
+            rows, columns = np.triu_indices(len(gram), 1)
+            upper[columns, rows] = upper[rows, columns]
+            return np.asarray(upper)
     return np.asarray(np.linalg.pinv(gram))
 
 
@@ -222,10 +235,7 @@ def _sidebands(steps: tuple[int, ...], turns: Array, residual: Array, turning: C
     """Phasors of the residual beside the excitation; ``turns`` is time over the block's duration."""
     if not steps:
         return np.zeros((0, residual.shape[1]), dtype=np.complex128)
-    powers = [np.exp(-2j * math.pi * turns)]
-    for _ in range(max(steps) - 1):
-        powers.append(powers[-1] * powers[0])
-    basis = np.stack([turning * (powers[s - 1] if s > 0 else np.conj(powers[-s - 1])) for s in steps])
+    basis = _turning_by(steps, turns.tobytes()) * turning
     # The slope in the fit has taken its share of each.
     left = np.sqrt(1.0 - 3.0 / (math.pi * np.array(steps)) ** 2)
     return np.asarray((basis @ residual) * (2.0 / (len(residual) * left))[:, None])

@@ -33,47 +33,107 @@ def steady_prior(F: Array, H: Array, Q: Array, R: Array) -> Array:
     numpy.linalg.LinAlgError
         If there is none: some state grows or wanders and no measurement tells of it.
     """
-    informed = H.T @ np.linalg.solve(R, H)
-    scale = np.sqrt(np.diag(Q))
-    scale[scale == 0.0] = 1.0
+    X = np.empty(F.shape)
+    if not settle(F, H, Q, R, X):
+        raise np.linalg.LinAlgError(
+            "no steady covariance: a state grows or wanders that no measurement tells of"
+        )
+    return X
+
+
+@kernel
+def settle(F: Array, H: Array, Q: Array, R: Array, X: Array) -> bool:
+    """`steady_prior` into X; False if there is none."""
+    n, p = len(F), len(R)
+    factor, told = R.copy(), H.copy()
+    if not solve_in_place(factor, told):
+        return False
+    informed = np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            for r in range(p):
+                informed[i, j] += H[r, i] * told[r, j]
+    scale = np.ones(n)
+    for i in range(n):
+        if Q[i, i] > 0.0:
+            scale[i] = np.sqrt(Q[i, i])
+    A, G = np.empty((n, n)), np.empty((n, n))
     # SI units lie many decades apart. The first pass finds how large each state's uncertainty is, the second works
     # in these units.
     for _ in range(2):
-        units = np.outer(scale, scale)
-        A, G, X = np.ascontiguousarray((F / scale[:, None] * scale).T), informed * units, Q / units
-        settled = double(A, G, X)
-        if not settled or not np.all(np.diag(X) >= 0.0):  # which no number is not
-            raise np.linalg.LinAlgError(
-                "no steady covariance: a state grows or wanders that no measurement tells of"
-            )
-        X *= units
-        std = np.sqrt(np.diag(X))
-        scale = np.where(std > 0.0, std, scale)
-    X = 0.5 * (X + X.T)
+        for i in range(n):
+            for j in range(n):
+                units = scale[i] * scale[j]
+                A[j, i] = F[i, j] / scale[i] * scale[j]
+                G[i, j], X[i, j] = informed[i, j] * units, Q[i, j] / units
+        if not double(A, G, X):
+            return False
+        for i in range(n):
+            if not X[i, i] >= 0.0:  # which no number is not
+                return False
+        for i in range(n):
+            for j in range(n):
+                X[i, j] *= scale[i] * scale[j]
+        for i in range(n):
+            if X[i, i] > 0.0:
+                scale[i] = np.sqrt(X[i, i])
+    for i in range(n):
+        for j in range(i):
+            X[i, j] = X[j, i] = 0.5 * (X[i, j] + X[j, i])
     # Where a measurement tells much more than was known, I + G X loses digits. Newton's method finds them again: the
     # residual, as it would go on through the filter's own samples.
+    change, closed = np.empty((n, n)), np.empty((n, n))
     for _ in range(2):
-        change, closed = _residual(F, H, Q, R, X)
-        units = np.outer(scale, scale)
-        change, closed = change / units, np.ascontiguousarray(closed / scale[:, None] * scale)
-        if np.max(np.abs(change)) <= 1e-15 or not sum_of_powers(closed, change):
+        residual(F, H, Q, R, X, change, closed)
+        largest = 0.0
+        for i in range(n):
+            for j in range(n):
+                change[i, j] /= scale[i] * scale[j]
+                closed[i, j] *= scale[j] / scale[i]
+                largest = max(largest, abs(change[i, j]))
+        if largest <= 1e-15 or not sum_of_powers(closed, change):
             break
-        X = X + 0.5 * (change + change.T) * units
-    return np.asarray(X)
+        for i in range(n):
+            for j in range(i + 1):
+                step = 0.5 * (change[i, j] + change[j, i]) * (scale[i] * scale[j])
+                X[i, j] += step
+                if j < i:
+                    X[j, i] += step
+    return True
 
 
-def _residual(F: Array, H: Array, Q: Array, R: Array, prior: Array) -> tuple[Array, Array]:
-    """What one sample adds to a covariance before a measurement, and ``F (I - K H)``."""
-    residual = H @ prior @ H.T + R
-    gain = np.linalg.solve(residual, H @ prior).T
-    closed = F @ (np.eye(len(F)) - gain @ H)
-    through = F @ gain
-    return closed @ prior @ closed.T + through @ R @ through.T + Q - prior, closed
+@kernel
+def residual(F: Array, H: Array, Q: Array, R: Array, prior: Array, change: Array, closed: Array) -> None:
+    """What one sample adds to a prior covariance into ``change``, and ``F (I - K H)`` into ``closed``."""
+    n, p = len(F), len(R)
+    seen, spread = np.empty((p, n)), np.empty((p, p))
+    multiply(H, prior, seen)
+    multiply_transposed(seen, H, spread)
+    for r in range(p):
+        for q in range(p):
+            spread[r, q] += R[r, q]
+    solve_in_place(spread, seen)  # the gain, transposed
+    through, left, half = np.empty((n, p)), np.empty((n, n)), np.empty((n, n))
+    multiply_transposed(F, seen, through)
+    multiply(through, H, half)
+    for i in range(n):
+        for j in range(n):
+            closed[i, j] = F[i, j] - half[i, j]
+    multiply(closed, prior, half)
+    multiply_transposed(half, closed, change)
+    noise = np.empty((n, p))
+    multiply(through, R, noise)
+    multiply_transposed(noise, through, left)
+    for i in range(n):
+        for j in range(n):
+            change[i, j] += left[i, j] + Q[i, j] - prior[i, j]
 
 
 def riccati_step(F: Array, H: Array, Q: Array, R: Array, prior: Array) -> Array:
     """One sample of the recursion whose steady state `steady_prior` is."""
-    return np.asarray(prior + _residual(F, H, Q, R, prior)[0])
+    change, closed = np.empty(F.shape), np.empty(F.shape)
+    residual(F, H, Q, R, np.array(prior), change, closed)
+    return np.asarray(prior + change)
 
 
 @kernel

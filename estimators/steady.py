@@ -5,6 +5,7 @@ In the coordinates of its own modes (pairs of states that know nothing of the ot
 products per state instead of n; all else has no memory and is worked out for many samples at once.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,20 +79,26 @@ def steady_filter(
     worst_condition
         Above it the recursion keeps the states as they are.
     """
-    n = len(F)
+    n, p, m = len(F), len(H), B0.shape[1]
     root = np.linalg.cholesky(residual)
     whitening = np.linalg.inv(root)
-    innovation_of_signals = np.hstack([-H @ B0, -H @ B1 - D, np.eye(len(H))])
+    innovation_of_signals = np.zeros((p, 2 * m + p))
+    innovation_of_signals[:, :m] = -H @ B0
+    innovation_of_signals[:, m : 2 * m] = -H @ B1 - D
+    innovation_of_signals[:, 2 * m :] = np.eye(p)
     closed = F - gain @ H @ F
-    of_signals = np.hstack([B0, B1, np.zeros((n, len(H)))]) + gain @ innovation_of_signals
+    of_signals = gain @ innovation_of_signals
+    of_signals[:, :m] += B0
+    of_signals[:, m : 2 * m] += B1
     scaled_shapes, blocks = _modes(closed / scale[:, None] * scale)
-    separate = np.linalg.cond(scaled_shapes) <= worst_condition
-    if not separate:
-        scaled_shapes, blocks = np.eye(n), np.zeros((0, 4))
+    back = _inverse_of_sound(scaled_shapes, worst_condition)
+    separate = back is not None
+    if back is None:
+        scaled_shapes, back, blocks = np.eye(n), np.eye(n), np.zeros((0, 4))
     size = -(-n // 4) * 4
     shapes, inverse = np.zeros((n, size)), np.zeros((size, n))
     shapes[:, :n] = scale[:, None] * scaled_shapes
-    inverse[:n] = np.linalg.inv(scaled_shapes) / scale
+    inverse[:n] = back / scale
     pairs = np.zeros((size // 2 if separate else 0, 4))
     pairs[: len(blocks)] = blocks
     columns = np.zeros((size, size))
@@ -106,6 +113,16 @@ def steady_filter(
         normalised_of_signals=read_only(whitening @ innovation_of_signals),
         root=read_only(root),
     )
+
+
+def _inverse_of_sound(shapes: Array, worst_condition: float) -> Array | None:
+    """Inverse of shapes that can be told apart: condition number in Frobenius' norm, at least that in the 2-norm."""
+    try:
+        inverse = np.linalg.inv(shapes)
+    except np.linalg.LinAlgError:
+        return None
+    condition = math.sqrt(float(np.vdot(shapes, shapes)) * float(np.vdot(inverse, inverse)))
+    return np.asarray(inverse) if condition <= worst_condition else None
 
 
 def _modes(A: Array) -> tuple[Array, Array]:

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from twin.plant.blocks import Block, Channel, make_block
-from twin.plant.config import ForceActuator, Plant, Sensor
+from twin.plant.config import DampingTable, ForceActuator, Plant, Sensor
 from twin.plant.files import load_plant
-from twin.plant.inputs import DriveReader, InputSource, choose_inputs, driven_model
+from twin.plant.inputs import DampedModels, DriveReader, InputSource, choose_inputs, driven_model
 from twin.plant.parallel import ParallelPlant
 
 RATE_HZ = 50_000.0
@@ -133,3 +133,37 @@ def test_plant_in_parallel_settles_to_the_response_of_its_recorded_drive(rig: Pl
     expected = (phasor[:, None] * np.exp(2j * np.pi * 47.0 * t[late])).real.T
     scale = np.abs(phasor)
     assert np.max(np.abs(y[late] - expected) / scale) < 1e-4
+
+
+@pytest.mark.parametrize("preset", ["rig", "engine_vcm"])
+def test_models_of_one_damping_after_another_are_those_worked_out_anew(preset: str) -> None:
+    plant = load_plant(preset)
+    assert plant.absorber is not None
+    names = [s.name for s in plant.sensor] + [a.name for a in plant.actuator]
+    sources = choose_inputs(plant, names)
+    models = DampedModels(plant, sources, 50_000.0)
+    for damping in (0.0, 2.7, 20.5):
+        model, discrete = models.at(damping, 50.0)
+        fresh = driven_model(plant.with_damping(plant.absorber.name, damping), sources, 50_000.0, 50.0)
+        assert (model.states, model.inputs, model.outputs) == (
+            fresh[0].states,
+            fresh[0].inputs,
+            fresh[0].outputs,
+        )
+        for found, wanted in ((model, fresh[0]), (discrete, fresh[1])):
+            for key in ("A", "B", "C", "D") if found is model else ("F", "B0", "B1", "C", "D"):
+                np.testing.assert_allclose(getattr(found, key), getattr(wanted, key), rtol=1e-13, atol=1e-12)
+
+
+def test_models_follow_what_other_bodies_lose_at_another_frequency() -> None:
+    rig = load_plant("rig")
+    table = DampingTable(frequency_hz=(45.0, 55.0), ns_m=(5.0, 9.0))
+    plant = rig.with_damping(rig.primary.name, table)
+    sources = choose_inputs(plant, [s.name for s in plant.sensor])
+    models = DampedModels(plant, sources, 50_000.0)
+    assert plant.absorber is not None
+    for frequency_hz in (45.0, 52.0):
+        fresh, _ = driven_model(plant.with_damping(plant.absorber.name, 3.0), sources, 50_000.0, frequency_hz)
+        np.testing.assert_allclose(models.at(3.0, frequency_hz)[0].A, fresh.A, rtol=1e-13)
+    with pytest.raises(ValueError, match="no absorber"):
+        DampedModels(load_plant("shaker_v721"), sources, 50_000.0)

@@ -8,80 +8,36 @@ on nothing else, so that a replay repeats it.
 """
 
 import math
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from estimators.augmented import UnknownForce
-from estimators.damping import AbsorberBalance, DampingLearner, ForceBalance, LearnerSettings
-from estimators.excitation import ExcitationTracker, choose_reference
+from estimators.damping import DampingLearner
 from estimators.health import Health, HealthMonitor
 from estimators.observer import Observer
 from estimators.signal_check import Finding, SignalCheck
 from estimators.types import DampingCurve, Phasors, StateEstimate
-from tuning.loop import LoopFacts
-from tuning.retune import TuningGoal
 from twin.control.schedule import Acknowledgement, Command, GainSchedule
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import GROUND, ForceActuator, Plant
-from twin.plant.errors import InputError
-from twin.plant.inputs import DriveReader, InputSource, choose_inputs, driven_model
+from twin.plant.inputs import DampedModels, DriveReader, InputSource, choose_inputs, driven_model
 from twin.plant.parallel import ParallelPlant
 from twin.station.audit import SETTLED_1_S, SETTLED_BLOCKS, SETTLED_SHARE, AuditPoint, audit_point
 from twin.station.frame import Event, Frame, Performance
+from twin.station.identification import SETTLE_BLOCKS, Identification
 from twin.station.orders import Order
 from twin.station.performance import PerformanceMeter
-from twin.station.retuning import Retuning, RetuningSettings, Turn
+from twin.station.retuning import Retuning, Turn
+from twin.station.settings import SessionSettings, configuration, settings_from
 from twin.station.worker import AfterBlocks, Tuner, TunerHere
 
-SETTLE_BLOCKS = 3
-"""Blocks not learned from after the controller went on or off."""
-
-UNKNOWN_NS_M = 1.0
-"""Where the damping is less well known than this, an inconsistent model is no reason not to learn it."""
-
-REPRIEVE_S = 3.0
-"""A model that disagrees this long while the absorber's own force balance closes may be cured by learning."""
+__all__ = ["Session", "SessionSettings", "settings_from"]
 
 FORCE_STEP_HZ = 0.005
 """The model of an unmeasured force is rebuilt when the excitation has moved this far."""
 
 GRAVITY_M_S2 = 9.81
-
-STIFFNESS_SHARE = 0.005
-"""The force balance closes if the stiffness it gives has moved by no more than this share of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class SessionSettings:
-    """What a session is told besides the plant.
-
-    Attributes
-    ----------
-    loop
-        Sampling and delay of the rig's controller; None if there is no controller to tune.
-    schedule
-        The schedule the rig starts with; None likewise.
-    goal
-        Budget and margin of the tuner.
-    learner
-        Of the damping curve.
-    learned
-        What was learned before, as `DampingLearner.state` gives it, to go on from; None begins anew.
-    retuning
-        When gains are asked for and which become commands.
-    model_step_ns_m
-        The model is rebuilt when the damping in use has moved this far since.
-    """
-
-    loop: LoopFacts | None = None
-    schedule: GainSchedule | None = None
-    goal: TuningGoal = field(default_factory=TuningGoal)
-    learner: LearnerSettings = field(default_factory=LearnerSettings)
-    learned: dict[str, Any] | None = None
-    retuning: RetuningSettings = field(default_factory=RetuningSettings)
-    model_step_ns_m: float = 0.02
 
 
 class Session:
@@ -131,15 +87,11 @@ class Session:
             unknown_force=_unknown_force(plant, sources, self._frequency),
         )
         model, discrete = driven_model(plant, sources, sample_rate_hz, self._frequency)
-        self._parallel = ParallelPlant(DriveReader(sources, names), model, discrete)
-        self._parallel_rows = [model.outputs.index(s) for s in self.observer.sensors]
-
-        self._tracker: ExcitationTracker | None = None
-        self._balance: AbsorberBalance | None = None
-        self._learner: DampingLearner | None = None
-        self.retuning: Retuning | None = None
-        self._start_learning(names, recorded_commands, tuner)
-        self._modelled_damping = self._damping_now()
+        self._parallel = ParallelPlant(DriveReader(sources, names), model, discrete, self.observer.sensors)
+        self._models: DampedModels | None = None
+        self._identification = Identification(plant, names, settings)
+        self.retuning = self._start_retuning(recorded_commands, tuner)
+        self._modelled_damping = self._identification.damping_at(self._frequency)
         self._meter = PerformanceMeter(plant, names)
         self._to_audit: tuple[int, float, Performance, float, float] | None = None
         self._blocks = 0
@@ -152,29 +104,21 @@ class Session:
         self._check = SignalCheck(plant, names, sample_rate_hz, used)
         self._monitor = HealthMonitor(channels)
 
-    def _start_learning(
-        self, names: tuple[str, ...], recorded: dict[int, Command] | None, tuner: Tuner | None
-    ) -> None:
-        try:
-            self._balance = AbsorberBalance(self.plant, names)
-        except ValueError:
-            return
-        reference = choose_reference(self.plant, names)
-        if reference is None:
-            return
-        self._tracker = ExcitationTracker(reference, names)
+    def _start_retuning(self, recorded: dict[int, Command] | None, tuner: Tuner | None) -> Retuning | None:
         settings = self.settings
-        self._learner = _learner(self.plant, settings)
+        if self.learner is None:
+            return None
         if settings.loop is not None and tuner is None:
             when = AfterBlocks(settings.retuning.lag_blocks)
             tuner = TunerHere(self.plant, settings.loop, settings.goal, when)
-        if tuner is not None and settings.schedule is not None:
-            self.retuning = Retuning(settings.schedule, settings.goal, settings.retuning, tuner, recorded)
+        if tuner is None or settings.schedule is None:
+            return None
+        return Retuning(settings.schedule, settings.goal, settings.retuning, tuner, recorded)
 
     @property
     def learner(self) -> DampingLearner | None:
         """What learns the damping; None if the plant or its channels do not let it."""
-        return self._learner
+        return self._identification.learner
 
     @property
     def schedule(self) -> GainSchedule | None:
@@ -209,8 +153,8 @@ class Session:
         block = Block(0, twin.observer.sample_rate_hz, values, np.ones_like(valid), self.channels)
         twin._parallel.advance(block)
         twin._check.warm_up(block)
-        if twin._learner is not None:
-            twin._learner.warm_up()
+        if twin.learner is not None:
+            twin.learner.warm_up()
         # And a few blocks as they come, through everything: read-only, whole and with a gap.
         fs, n = twin.observer.sample_rate_hz, 2_000
         t = np.arange(4 * n)[:, None] / fs
@@ -239,10 +183,11 @@ class Session:
         block = checked.block
         self._note_masked(block, checked.findings, events)
         self._refresh_model()
-        twin = self._parallel.advance(block)[:, self._parallel_rows]
+        twin = self._parallel.advance(block)
         estimate = self.observer.advance(block)
         health = self._note_health(block, estimate, checked.findings, events)
-        phasors = self._tracker.advance(block) if self._tracker is not None else None
+        tracker = self._identification.tracker
+        phasors = tracker.advance(block) if tracker is not None else None
         moved = 0.0
         if phasors is not None:
             moved = phasors.frequency_hz - self._frequency if self._blocks else 0.0
@@ -328,54 +273,24 @@ class Session:
         health: Health,
         events: list[Event],
     ) -> DampingCurve | None:
-        if self._learner is None or self._balance is None:
+        curve = self._identification.learn(
+            block, phasors, findings, health, self._frequency, self._since_switch
+        )
+        if curve is None:
             return None
-        balance = self._balance.solve(phasors) if phasors is not None else None
-        objection = ""
-        if self._since_switch < SETTLE_BLOCKS:
-            objection = "control has just been switched"
-        elif findings:
-            names = dict.fromkeys(f"{f.channel} ({f.kind})" for f in findings)
-            objection = f"samples masked in {', '.join(names)}"
-        elif health.verdict != "consistent":
-            objection = self._distrust(block, health, balance)
-        curve = self._learner.advance(balance, block.n_samples / block.sample_rate_hz, objection)
         status = curve.status + (f": {curve.reason}" if curve.reason else "")
         if status != self._status:
             events.append(Event(block.first_sample, "info", f"damping {status}"))
             self._status = status
         return curve
 
-    def _distrust(self, block: Block, health: Health, balance: ForceBalance | None) -> str:
-        """Why an inconsistent model speaks against learning; empty where learning may be the cure."""
-        learner, absorber = self._learner, self.plant.absorber
-        if learner is None or absorber is None or health.test in ("signal", "noise", "bias"):
-            return health.reason
-        if learner.std_at(self._frequency) > UNKNOWN_NS_M:
-            return ""
-        known = learner.curve().stiffness_n_m
-        known = known if math.isfinite(known) else absorber.stiffness_n_m
-        closes = balance is not None and abs(balance.stiffness_n_m - known) <= (
-            STIFFNESS_SHARE * known + 5.0 * balance.stiffness_std_n_m
-        )
-        lasts_s = (block.end_sample - health.since_sample) / block.sample_rate_hz
-        return "" if closes and lasts_s > REPRIEVE_S else health.reason
-
-    def _damping_now(self) -> float:
-        if self._learner is None:
-            return 0.0
-        return self._learner.table().at(self._frequency)
-
     def damping_std_at(self, frequency_hz: float) -> float:
         """Standard deviation of the learned damping at a frequency [Ns/m]; 0 where none is learned."""
-        return 0.0 if self._learner is None else self._learner.std_at(frequency_hz)
+        return self._identification.std_at(frequency_hz)
 
     def identified_plant(self) -> Plant:
         """Return the plant with the damping in use."""
-        absorber = self.plant.absorber
-        if self._learner is None or absorber is None:
-            return self.plant
-        return self.plant.with_damping(absorber.name, self._learner.table())
+        return self._identification.plant
 
     def _follow_force(self, estimate: StateEstimate, phasors: Phasors | None) -> tuple[float, float] | None:
         """Amplitude of an exciting force that nothing measures, and its standard deviation [N]; None if all is."""
@@ -388,15 +303,14 @@ class Session:
         return found
 
     def _refresh_model(self) -> None:
-        damping = self._damping_now()
+        damping = self._identification.damping_at(self._frequency)
         if abs(damping - self._modelled_damping) <= self.settings.model_step_ns_m:
             return
         self._modelled_damping = damping
-        plant = self.identified_plant()
-        model, discrete = driven_model(
-            plant, self.observer.sources, self.observer.sample_rate_hz, self._frequency
-        )
-        self.observer.set_model(plant, model, discrete)
+        if self._models is None:
+            self._models = DampedModels(self.plant, self.observer.sources, self.observer.sample_rate_hz)
+        model, discrete = self._models.at(damping, self._frequency)
+        self.observer.set_model(self.identified_plant(), model, discrete)
         self._parallel.set_model(discrete)
 
     def _retune(
@@ -408,7 +322,7 @@ class Session:
         health: Health,
         force: tuple[float, float] | None,
     ) -> Turn:
-        if self.retuning is None or self._learner is None:
+        if self.retuning is None or self.learner is None:
             return Turn()
         amplitude = 0.0
         if phasors is not None and force is not None:
@@ -426,7 +340,7 @@ class Session:
             moved_hz,
             curve,
             self.identified_plant(),
-            self._learner,
+            self.learner,
             reference_rms=rms if math.isfinite(rms) else 0.0,
             doubt=health.reason if health.verdict == "diverged" else "",
         )
@@ -467,69 +381,7 @@ class Session:
 
     def configuration(self) -> dict[str, Any]:
         """Settings as plain data, for the recording; `settings_from` reads them back."""
-        s = self.settings
-        return {
-            "loop": None if s.loop is None else asdict(s.loop),
-            "goal": asdict(s.goal),
-            "schedule": None if s.schedule is None else s.schedule.model_dump(mode="json"),
-            "learner": asdict(s.learner),
-            "learned": s.learned,
-            "retuning": asdict(s.retuning),
-            "model_step_ns_m": s.model_step_ns_m,
-        }
-
-
-def settings_from(configuration: dict[str, Any]) -> SessionSettings:
-    """Read what `Session.configuration` wrote.
-
-    Raises
-    ------
-    InputError
-        If it is not that.
-    """
-    try:
-        c = dict(configuration)
-        loop, schedule = c.pop("loop"), c.pop("schedule")
-        if "retuning" not in c:  # recorded before these had a place of their own
-            c["retuning"] = {"every_blocks": c.pop("retune_every_blocks"), "min_change": c.pop("min_change")}
-        return SessionSettings(
-            loop=None if loop is None else LoopFacts(**loop),
-            schedule=None if schedule is None else GainSchedule.model_validate(schedule, strict=False),
-            goal=_settings(TuningGoal, "goal", c.pop("goal")),
-            learner=_settings(LearnerSettings, "learner", c.pop("learner")),
-            retuning=_settings(RetuningSettings, "retuning", c.pop("retuning")),
-            **c,
-        )
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"the recording's configuration cannot be read ({error}); was it made by another version?"
-        ) from error
-
-
-_S = TypeVar("_S")
-
-
-def _settings(kind: type[_S], name: str, values: dict[str, Any]) -> _S:
-    """Build settings; a key that is no longer one would change results if it were passed over."""
-    known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
-    unknown = [f"{name}.{key}" for key in values if key not in known]
-    if unknown:
-        raise InputError(
-            f"the recording was made by a version with the setting {', '.join(unknown)}, which this one does not have: "
-            "replay it with that version, or export its samples (atmd recordings export) and replay those with --plant"
-        )
-    return kind(**values)
-
-
-def _learner(plant: Plant, settings: SessionSettings) -> DampingLearner:
-    if settings.learned is None:
-        return DampingLearner(plant, settings.learner)
-    try:
-        return DampingLearner.restored(settings.learned, plant)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"what was learned before cannot be used ({error}); begin without it") from error
+        return configuration(self.settings)
 
 
 def _unknown_force(
