@@ -101,13 +101,20 @@ def facts(pairs: Iterable[tuple[str, object]]) -> Html:
     return element("dl", rows, class_="facts")
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers: Iterable[int] = ()) -> Html:
+def table(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    numbers: Iterable[int] = (),
+    identifiers: Sequence[str] = (),
+) -> Html:
     """A table that scrolls by itself where it is too wide.
 
     Parameters
     ----------
     numbers
         Columns set to the right.
+    identifiers
+        Of the rows, to be jumped to.
     """
     right = set(numbers)
 
@@ -118,7 +125,10 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers: Itera
             for k, cell in enumerate(row)
         )
 
-    body = join(join((element("tr", cells("td", row)), Html("\n"))) for row in rows)
+    def line(k: int, row: Sequence[object]) -> Html:
+        return element("tr", cells("td", row), **({"id": identifiers[k]} if identifiers else {}))
+
+    body = join(join((line(k, row), Html("\n"))) for k, row in enumerate(rows))
     head = element("thead", element("tr", cells("th", heads)))
     return element("div", element("table", head, element("tbody", body)), class_="scroll", tabindex="0")
 

@@ -1,10 +1,10 @@
 """The validation as a web page: every figure of the thesis as a row, its plots drawn anew, nothing loaded from afar."""
 
-import html
 from collections.abc import Callable
 from pathlib import Path
 
 from twin.plant.errors import InputError
+from twin.station.report.page import Html, badge, element, join, page, section, table, text, tiles
 from twin.station.validation import drawings_absorbers, drawings_control, drawings_rig
 from twin.station.validation.canvas import Drawing, save
 from twin.station.validation.catalogue import counts
@@ -39,31 +39,6 @@ NOT_DRAWN = (
 )  # fmt: skip
 
 _MARK = {"reproduced": "good", "differs": "bad", "not reproducible": "open"}
-
-_STYLE = """
-:root { color-scheme: light; --line: #e0e4e7; --text: #1c2529; --dim: #5b6b73; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 74rem; padding: 2rem 1.5rem 4rem; color: var(--text); background: #fff;
-  font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
-h1 { font-size: 1.9rem; margin: 0 0 .3rem; } h2 { margin: 2.6rem 0 .8rem; font-size: 1.35rem; }
-p { max-width: 52rem; } .dim, small { color: var(--dim); }
-.counts { display: flex; flex-wrap: wrap; gap: .8rem; margin: 1.4rem 0; }
-.counts div { border: 1px solid var(--line); border-radius: .5rem; padding: .6rem 1.1rem; }
-.counts b { display: block; font-size: 1.6rem; line-height: 1.2; }
-.badge { display: inline-block; border-radius: .7rem; padding: .02rem .55rem; font-size: .78rem; white-space: nowrap; }
-.good { background: #e3f2e6; color: #1b5e20; } .bad { background: #fdeaea; color: #a31515; }
-.open { background: #eef1f3; color: #455a64; }
-figure { margin: 0 0 2.4rem; padding: 1rem 1.2rem; border: 1px solid var(--line); border-radius: .6rem; }
-figure img { display: block; width: 100%; height: auto; margin: .6rem auto; }
-figure.single img { max-width: 46rem; } figcaption { max-width: 60rem; }
-h3 { margin: 0; font-size: 1.05rem; } .badges { margin-top: .5rem; display: flex; flex-wrap: wrap; gap: .35rem; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-size: .86rem; }
-th, td { text-align: left; vertical-align: top; padding: .4rem .6rem; border-bottom: 1px solid var(--line); }
-th { background: #fff; border-bottom: 2px solid #b0bec5; }
-td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-code { font: .82rem ui-monospace, "SF Mono", Consolas, monospace; } td:first-child { min-width: 11.5rem; }
-nav a { margin-right: 1.1rem; } a { color: #1565c0; }
-"""
 
 
 def write_report(
@@ -114,65 +89,70 @@ def percent(row: Row) -> str:
     return f"{100.0 * row.relative_error:.2g} %"
 
 
-def _page(rows: list[Row], figures: list[str]) -> str:
+def _page(rows: list[Row], figures: list[Html]) -> str:
     found = counts(rows)
-    tiles = "".join(
-        f'<div><b>{found[name]}</b><span class="badge {_MARK[name]}">{name}</span></div>' for name in _MARK
-    )
-    left_out = "".join(f"<li>{html.escape(which)}: {html.escape(why)}.</li>" for which, why in NOT_DRAWN)
-    columns = ("figure", "source", "thesis", "computed", "unit", "error", "verdict", "note")
-    heads = "".join(f"<th>{name}</th>" for name in columns)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>The thesis, recomputed</title><style>{_STYLE}</style></head>
-<body>
-<h1>The thesis, recomputed</h1>
-<p class="dim">Every figure that the thesis prints or states, beside what this program computes from the thesis's
-own parameters. Nothing here was measured: the rig is the simulated one.</p>
-<div class="counts">{tiles}<div><b>{found["rows"]}</b>figures in all</div></div>
-<p><b>Reproduced</b>: the two agree within the row's tolerance, which follows from the digits that are printed or
-from how the figure was read. <b>Differs</b>: they do not; the note says why and which one is right.
-<b>Not reproducible</b>: the thesis shows it in a plot that the scan lacks, or it was measured and its data are not
-printed; a computed value stands for itself.</p>
-<nav><a href="#plots">Plots</a><a href="#figures">All figures</a><a href="#left-out">Not drawn</a></nav>
-<h2 id="plots">Plots</h2>
-{"".join(figures)}
-<h2 id="figures">All figures</h2>
-<div class="scroll"><table>
-<thead><tr>{heads}</tr></thead>
-<tbody>
-{"".join(_row(row) for row in rows)}
-</tbody></table></div>
-<h2 id="left-out">Not drawn</h2>
-<ul>{left_out}</ul>
-</body></html>
-"""
+    numbers: list[tuple[object, object]] = [(found[name], badge(name, kind)) for name, kind in _MARK.items()]
+    links = (("#plots", "Plots"), ("#figures", "All figures"), ("#left-out", "Not drawn"))
+    heads = ("figure", "source", "thesis", "computed", "unit", "error", "verdict", "note")
+    body = join((
+        element("h1", "The thesis, recomputed"),
+        element(
+            "p",
+            "Every figure that the thesis prints or states, beside what this program computes from the thesis's own "
+            "parameters. Nothing here was measured: the rig is the simulated one.",
+            class_="dim",
+        ),
+        tiles([*numbers, (found["rows"], "figures in all")]),
+        Html(
+            "<p><b>Reproduced</b>: the two agree within the row's tolerance, which follows from the digits that are "
+            "printed or from how the figure was read. <b>Differs</b>: they do not; the note says why and which one is "
+            "right. <b>Not reproducible</b>: the thesis shows it in a plot that the scan lacks, or it was measured and "
+            "its data are not printed; a computed value stands for itself.</p>"
+        ),
+        element("nav", join(element("a", name, href=target) for target, name in links)),
+        section("Plots", "plots", *figures),
+        section("All figures", "figures", table(heads, map(_row, rows), (2, 3, 5), [row.id for row in rows])),
+        section(
+            "Not drawn",
+            "left-out",
+            element("ul", join(element("li", f"{which}: {why}.") for which, why in NOT_DRAWN)),
+        ),
+    ))  # fmt: skip
+    return page("The thesis, recomputed", body, self_contained=False)
 
 
-def _figure(drawing: Drawing, picture: str, verdicts: dict[str, Row]) -> str:
-    badges = "".join(
-        f'<span class="badge {_MARK[verdicts[name].verdict]}" title="{html.escape(verdicts[name].note)}">'
-        f"{html.escape(name)}: {verdicts[name].verdict}</span>"
+def _figure(drawing: Drawing, picture: str, verdicts: dict[str, Row]) -> Html:
+    badges = join(
+        element(
+            "span",
+            f"{name}: {verdicts[name].verdict}",
+            class_=f"badge {_MARK[verdicts[name].verdict]}",
+            title=verdicts[name].note,
+        )
         for name in drawing.rows
     )
     if not badges:
-        badges = '<span class="badge open">drawn from the model; the scan has no numbers to compare</span>'
-    kind = "single" if drawing.panels == 1 else "wide"
-    title = html.escape(drawing.title)
-    return f"""<figure class="{kind}" id="{drawing.name}"><h3>{title}</h3>
-<small>thesis {html.escape(drawing.source)}</small>
-<img src="{picture}" alt="{title}" loading="lazy">
-<figcaption>{html.escape(drawing.caption)}<div class="badges">{badges}</div></figcaption></figure>
-"""
-
-
-def _row(row: Row) -> str:
-    name = row.id.replace(".", ".<wbr>").replace("_", "_<wbr>")
-    return (
-        f'<tr id="{row.id}"><td><code>{name}</code></td><td>{html.escape(row.source)}</td>'
-        f'<td class="n">{number(row.thesis)}</td><td class="n">{number(row.computed)}</td>'
-        f'<td>{html.escape(row.unit)}</td><td class="n">{percent(row)}</td>'
-        f'<td><span class="badge {_MARK[row.verdict]}">{row.verdict}</span></td>'
-        f"<td>{html.escape(row.note)}</td></tr>\n"
+        badges = badge("drawn from the model; the scan has no numbers to compare", "open")
+    return element(
+        "figure",
+        element("h3", drawing.title),
+        element("small", f"thesis {drawing.source}"),
+        Html(f'<img src="{text(picture)}" alt="{text(drawing.title)}" loading="lazy">'),
+        element("figcaption", drawing.caption, element("div", badges, class_="badges")),
+        class_="single" if drawing.panels == 1 else "wide",
+        id=drawing.name,
     )
+
+
+def _row(row: Row) -> list[object]:
+    name = Html(text(row.id).replace(".", ".<wbr>").replace("_", "_<wbr>"))
+    return [
+        element("code", name),
+        row.source,
+        number(row.thesis),
+        number(row.computed),
+        row.unit,
+        percent(row),
+        badge(row.verdict, _MARK[row.verdict]),
+        row.note,
+    ]
