@@ -60,7 +60,7 @@ class _Ahead:
         first, second = (self, other) if self.sequence < other.sequence else (other, self)
         apart = second.sequence - first.sequence
         return (
-            apart > 0
+            0 < apart <= REMEMBERED
             and second.block.first_sample == first.block.first_sample + apart * first.block.n_samples
         )
 

@@ -125,6 +125,7 @@ class RigGateway:
         self.in_control = True
         self._complaints = Complaints()
         self._announced: dict[Hello, int] = {}
+        self._sighted: SamplesHeader | None = None
         self._unanswered: set[int] = set()
         self._off: Command | None = None
         self._start_due_s = 0.0
@@ -491,7 +492,7 @@ class RigGateway:
             self._complain("the header of a block cannot be read", _first(error))
             return
         if header.run_id != run.hello.run_id:
-            hello = self._announced_as(header.run_id)
+            hello = self._announced_as(header)
             if hello is None:
                 # Of a run that is over, or whose hello has not come yet: its place will be masked.
                 self._complain("a block of another run")
@@ -530,10 +531,17 @@ class RigGateway:
                 "a block's number and place contradict those of the others", f"number {header.sequence}"
             )
 
-    def _announced_as(self, run_id: str) -> Hello | None:
-        """The hello of a run; the one said most often, if there are several."""
-        found = [h for h in self._announced if h.run_id == run_id]
-        return max(found, key=lambda h: self._announced[h], default=None)
+    def _announced_as(self, header: SamplesHeader) -> Hello | None:
+        """The hello of another run, if it has begun: with its first block, or two that agree on where it is."""
+        found = [h for h in self._announced if h.run_id == header.run_id]
+        if not found:
+            return None
+        before, self._sighted = self._sighted, header
+        begins = header.sequence == 0 and header.first_sample == 0
+        if before is not None and before.run_id == header.run_id:
+            apart = header.sequence - before.sequence
+            begins |= apart == 1 and header.first_sample == before.first_sample + before.n_samples
+        return max(found, key=lambda h: self._announced[h]) if begins else None
 
     def _complain(self, kind: str, words: str = "") -> None:
         self._complaints.add(kind, words)

@@ -8,10 +8,11 @@ after half a second of this machine's time.
 
 import contextlib
 import json
+import math
 import secrets
 import time
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, TypeGuard
 
 import zmq
 from pydantic import ValidationError
@@ -19,9 +20,20 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from twin.control.schedule import Acknowledgement, Command
 from twin.plant.errors import InputError, RunError
+from twin.rig.complaints import Complaints, plain
+from twin.rig.daqmx import DaqmxRig
 from twin.rig.messages import VERSION, Hello, SamplesHeader, WireChannel
 from twin.rig.simulated import SimulatedRig
-from twin.rig.wire import TOPIC_END, TOPIC_HELLO, TOPIC_SAMPLES, KeyPair, decode, encode, guard_server
+from twin.rig.wire import (
+    ANOTHER_STATION,
+    TOPIC_END,
+    TOPIC_HELLO,
+    TOPIC_SAMPLES,
+    KeyPair,
+    decode,
+    encode,
+    guard_server,
+)
 
 HEARTBEAT_TIMEOUT_S = 0.5
 """Without a heartbeat for so long the rig switches its controller off."""
@@ -32,6 +44,14 @@ STALE_S = 1.0
 LEAD_BLOCKS = 2
 """Blocks the rig may be ahead of what the station has worked through, when it does not keep real time."""
 
+EARLY_S = 60.0
+"""A command may be due so far ahead; and so many may wait."""
+MOST_WAITING = 100
+
+MAX_COMMAND_BYTES = 1024 * 1024
+MOST_AT_ONCE = 200
+"""Messages read before the rig looks at its samples again: a flood of them must not hold up a block."""
+
 START_TIMEOUT_S = 60.0
 STATION_SILENT_S = 30.0
 HELLO_EVERY_S = 0.02
@@ -41,16 +61,19 @@ HELLO_EVERY_STREAMING_S = 1.0
 class _KnownStations:
     """Let the listed public keys in and nobody else."""
 
-    def __init__(self, public: Collection[bytes]) -> None:
-        self._public = frozenset(public)
+    def __init__(self, public: Collection[bytes], complaints: Complaints) -> None:
+        self._public, self._complaints = frozenset(public), complaints
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Answer the authenticator."""
-        return key in self._public
+        known = key in self._public
+        if not known:
+            self._complaints.add("a station with an unknown key was refused", key.decode("ascii", "replace"))
+        return known
 
 
 class RigServer:
-    """Serve one `SimulatedRig` until its programme ends or whoever started it is gone.
+    """Serve one rig, simulated or measured by a device, until its programme ends or whoever started it is gone.
 
     Parameters
     ----------
@@ -69,6 +92,13 @@ class RigServer:
         for one station, and ends with it.
     starter_gone
         Whether nobody is left who would miss this rig.
+    say
+        Takes lines for the person at the rig: what was refused and why, and who has the controls.
+
+    Attributes
+    ----------
+    complaints
+        What was refused, by reason.
 
     Raises
     ------
@@ -78,7 +108,7 @@ class RigServer:
 
     def __init__(
         self,
-        rig: SimulatedRig,
+        rig: SimulatedRig | DaqmxRig,
         keys: KeyPair,
         stations: Collection[bytes],
         speed: float,
@@ -88,13 +118,15 @@ class RigServer:
         commands_port: int = 0,
         stands_alone: bool = False,
         starter_gone: Callable[[], bool] = lambda: False,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.rig, self.speed = rig, speed
+        self._say, self.complaints = say, Complaints()
         self._stands_alone, self._starter_gone = stands_alone, starter_gone
         self._context = zmq.Context()
         self._authenticator = ThreadAuthenticator(self._context)
         self._authenticator.start()
-        self._authenticator.configure_curve_callback("rig", _KnownStations(stations))
+        self._authenticator.configure_curve_callback("rig", _KnownStations(stations, self.complaints))
         self._samples = self._context.socket(zmq.PUB)
         # A slow station is held back by its heartbeats; a rig of its own waits for nobody.
         self._samples.sndhwm = 600 if stands_alone else 0
@@ -112,7 +144,6 @@ class RigServer:
         self._heard_sample, self._heard_s = 0, 0.0
         self._started = self._stopped = self._fallen_back = False
         self._station_sample = self._last_command = 0
-        self._early: list[Acknowledgement] = []
         self._hello_due = 0.0
 
     def run(self) -> None:
@@ -127,7 +158,9 @@ class RigServer:
             if not self._stands_alone:
                 self._await(lambda: self._started, START_TIMEOUT_S, "no station came", hello=True)
             self._stream()
-            self._samples.send_multipart([TOPIC_END, encode({"next_sample": self.rig.next_sample})])
+            self._samples.send_multipart(
+                [TOPIC_END, encode({"next_sample": self.rig.next_sample, "run_id": self._run_id})]
+            )
             if not self._stands_alone:
                 self._await(lambda: self._stopped, STATION_SILENT_S, "the station did not take its leave")
         finally:
@@ -153,7 +186,6 @@ class RigServer:
     def _stream(self) -> None:
         programme = self.rig.programme
         self._last_block_s = time.monotonic()
-        sequence = 0
         while not self.rig.finished and not self._stopped:
             if self.speed > 0.0:
                 self._poll(0.0)
@@ -170,8 +202,9 @@ class RigServer:
             if time.monotonic() >= self._hello_due:
                 self._say_hello()
                 self._hello_due = time.monotonic() + HELLO_EVERY_STREAMING_S
-            first = self.rig.next_sample
             values, control_on, acknowledgements = self.rig.next_block()
+            first = self.rig.next_sample - len(values)
+            sequence = first // programme.block_samples  # a device's overrun leaves blocks out
             self._fallen_back = self._fallen_back and not self.rig.control_enabled
             if self.speed > 0.0:
                 self._await_due(programme.block_s / self.speed)
@@ -189,7 +222,6 @@ class RigServer:
             self._samples.send_multipart([TOPIC_SAMPLES, header.model_dump_json().encode(), samples])
             for acknowledgement in acknowledgements:
                 self._answer(self._station, {"type": "ack", **acknowledgement.model_dump()})
-            sequence += 1
             if self._starter_gone():
                 raise RunError("the starter of this rig is gone")
 
@@ -210,6 +242,7 @@ class RigServer:
             self._poll(0.0)
             now = time.monotonic()
             if self._station is None:
+                self._watch_the_station()
                 left = self._last_block_s + programme.block_s - now
             elif self.rig.next_sample - self._station_sample <= lead:
                 left = 0.0
@@ -231,6 +264,8 @@ class RigServer:
 
     def _lose_the_station(self) -> None:
         # Safe gains: none. What the station last ordered may not fit what the rig does by now.
+        if self._station is not None or self.rig.control_enabled:
+            self._say(f"no station for {HEARTBEAT_TIMEOUT_S:g} s: control off")
         if self.rig.control_enabled:
             self.rig.control_enabled, self._fallen_back = False, True
         self._station = None if self._stands_alone else self._station
@@ -253,30 +288,27 @@ class RigServer:
         self._samples.send_multipart([TOPIC_HELLO, hello.model_dump_json().encode()])
 
     def _poll(self, timeout_s: float) -> None:
-        if self._commands.poll(max(0, round(timeout_s * 1e3))):
+        if self._commands.poll(max(0, math.ceil(timeout_s * 1e3))):
             with contextlib.suppress(zmq.Again):
-                while True:
+                for _ in range(MOST_AT_ONCE):
                     sender, *frames = self._commands.recv_multipart(flags=zmq.NOBLOCK)
                     self._take(sender, frames)
+        for line in self.complaints.said():
+            self._say(line)
 
     def _take(self, sender: bytes, frames: list[bytes]) -> None:
-        try:
-            message = decode(frames[0]) if len(frames) == 1 else {}
-        except RunError as error:
-            self._answer(sender, {"type": "refused", "reason": str(error)})
+        message = self._read(sender, frames)
+        if message is None:
             return
-        kind = message.get("type")
-        if kind not in ("start", "stop", "heartbeat", "command"):
-            self._answer(sender, {"type": "refused", "reason": "unknown message"})
-            return
+        kind = message["type"]
         taken_over = self._station is None and kind != "stop"
         if taken_over:
             self._give_controls(sender)
         if sender != self._station:
             if kind == "command":
-                self._answer(sender, _refusal(message.get("command"), "another station has the controls"))
+                self._refuse_command(sender, message.get("command"), ANOTHER_STATION)
             elif kind == "start":
-                self._answer(sender, {"type": "refused", "reason": "another station has the controls"})
+                self._refuse(sender, ANOTHER_STATION)
             return
         match kind:
             case "start":
@@ -295,15 +327,45 @@ class RigServer:
             case "command":
                 self._command(sender, message.get("command"))
             case _:
-                self._answer(sender, {"type": "refused", "reason": "a heartbeat needs a whole next_sample"})
+                self._refuse(sender, "a heartbeat needs a whole next_sample")
+
+    def _read(self, sender: bytes, frames: list[bytes]) -> dict[str, Any] | None:
+        """One message; None, and the sender told, if it is none."""
+        size = sum(map(len, frames))
+        if len(frames) != 1:
+            self._refuse(sender, f"a message has one frame, not {len(frames)}")
+        elif size > MAX_COMMAND_BYTES:
+            self._refuse(sender, f"a message of {size} bytes is too large; {MAX_COMMAND_BYTES} are taken")
+        else:
+            try:
+                message = decode(frames[0])
+            except RunError as error:
+                self._refuse(sender, str(error))
+                return None
+            kind = message.get("type")
+            if isinstance(kind, str) and kind in ("start", "stop", "heartbeat", "command"):
+                return message
+            self._refuse(sender, "unknown message")
+        return None
+
+    def _refuse(self, sender: bytes, reason: str) -> None:
+        self.complaints.add("a message was refused", reason)
+        self._answer(sender, {"type": "refused", "reason": plain(reason)})
+
+    def _refuse_command(self, sender: bytes, body: object, reason: str) -> None:
+        self.complaints.add("a command was refused", reason)
+        self._answer(sender, _refusal(body, plain(reason, 500)))
 
     def _give_controls(self, sender: bytes) -> None:
         """Whoever speaks first has the controls, until leaving or falling silent; what was before it is not its own."""
         self._station, self._last_command = sender, 0
         self._station_sample = self._heard_sample = self.rig.next_sample
         self._heard_s = time.monotonic()
+        self._answer(sender, {"type": "controls"})
+        self._say("a station has the controls")
 
     def _leave(self) -> None:
+        self._say("the station took its leave")
         if not self._stands_alone:
             self._stopped = True
             return
@@ -317,11 +379,11 @@ class RigServer:
         except ValidationError as error:
             problem = error.errors()[0]["msg"]
             reason = f"malformed command: {error.error_count()} problems, first: {problem}"
-            self._answer(sender, _refusal(body, reason))
+            self._refuse_command(sender, body, reason)
             return
         reason = self._objection(command)
         if reason:
-            self._answer(sender, _refusal(body, reason))
+            self._refuse_command(sender, body, reason)
             return
         self._last_command = command.command_id
         self.rig.accept(command)
@@ -337,7 +399,12 @@ class RigServer:
                 f"command {command.command_id} was made for model {command.config_id}, "
                 f"this rig is set up for {rig.programme.plant.fingerprint}"
             )
-        late_s = (rig.next_sample - command.apply_at_sample) / rig.programme.sample_rate_hz
+        rate = rig.programme.sample_rate_hz
+        if command.apply_at_sample > rig.next_sample + EARLY_S * rate:
+            return f"command {command.command_id} is due more than {EARLY_S:g} s ahead"
+        if rig.waiting >= MOST_WAITING:
+            return f"command {command.command_id} finds {rig.waiting} others waiting for their samples"
+        late_s = (rig.next_sample - command.apply_at_sample) / rate
         only_off = command.schedule is None and command.control_enabled is False
         if self.speed > 0.0 and late_s > STALE_S and not only_off:
             return f"command {command.command_id} is stale: it was due {late_s:.1f} s ago"
@@ -361,11 +428,11 @@ def _bind(socket: "zmq.Socket[bytes]", host: str, port: int) -> int:
     return port
 
 
-def _whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+def _whole(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 2**62
 
 
 def _refusal(body: object, reason: str) -> dict[str, Any]:
-    number = body.get("command_id", 0) if isinstance(body, dict) else 0
+    number = body.get("command_id") if isinstance(body, dict) else None
     refused = Acknowledgement(command_id=number if _whole(number) else 0, accepted=False, reason=reason)
     return {"type": "ack", **refused.model_dump()}

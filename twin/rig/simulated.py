@@ -107,6 +107,11 @@ class SimulatedRig:
         """Whether the programme is over."""
         return self.next_sample >= self.programme.n_blocks * self.programme.block_samples
 
+    @property
+    def waiting(self) -> int:
+        """Commands that have been taken in and wait for their sample."""
+        return len(self._pending)
+
     def frequency_at(self, sample: int) -> float:
         """Excitation frequency at a sample [Hz]."""
         return self.programme.sweep.frequency_at(sample, self.programme.sample_rate_hz)
