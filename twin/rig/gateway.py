@@ -90,8 +90,6 @@ class RigGateway:
 
     Attributes
     ----------
-    notice
-        What the rig says of itself, with the latest block; empty if nothing.
     drift
         `ClockDrift` of rig against station.
     restarts
@@ -119,7 +117,7 @@ class RigGateway:
             socket.connect(address)
         for topic in (TOPIC_HELLO, TOPIC_SAMPLES, TOPIC_END):
             self._samples.subscribe(topic)
-        self.notice = ""
+        self._rig_notice = ""
         self.drift = ClockDrift()
         self.restarts = 0
         self.in_control = True
@@ -149,6 +147,12 @@ class RigGateway:
         return ArrivalCounts(
             *(getattr(self._past, name) + getattr(now, name) for name in ArrivalCounts.__slots__)
         )
+
+    @property
+    def notice(self) -> str:
+        """What the rig says of itself, with the latest block, and of who has the controls; empty if nothing."""
+        watching = "" if self.in_control else f"{ANOTHER_STATION}; this one only watches"
+        return "; ".join(words for words in (self._rig_notice, watching) if words)
 
     @property
     def malformed(self) -> int:
@@ -340,6 +344,7 @@ class RigGateway:
             )
             return
         self._unanswered.discard(answer.command_id)
+        self.in_control = self.in_control or answer.accepted
         changes: dict[str, Any] = {"reason": plain(answer.reason)}
         if at is not None:
             changes["applied_at_sample"] = at + self._offset
@@ -521,7 +526,7 @@ class RigGateway:
         for due in run.arrivals.take(block, header.sequence):
             if due is block:
                 self._last_arrival_s = arrived_s
-                self.notice = plain(header.notice, 500)
+                self._rig_notice = plain(header.notice, 500)
             yield due
         if counts.received == received + 1:  # in its turn: others waited for somebody
             end = header.first_sample + header.n_samples

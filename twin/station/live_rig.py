@@ -111,12 +111,13 @@ def run_live(options: LiveOptions, say: Callable[[str], None]) -> dict[str, Any]
             say(f"operator page: {page.url}")
             if page.warning:
                 say(f"warning: {page.warning}")
-        loop = Loop(session, outputs, gateway, desk, _Remarks(gateway, say))
+        remarks = _Remarks(gateway, say)
+        loop = Loop(session, outputs, gateway, desk, remarks)
         error, interrupted = "", False
         gateway.start()
         say(f"connected: {_in_words(hello)}")
         try:
-            _go_on(loop, gateway, options, _Silence(say))
+            _go_on(loop, gateway, options, _Silence(say, remarks))
         except RunError as failure:
             error = str(failure)
         except LiveEnd:
@@ -220,8 +221,16 @@ class _Remarks:
 
     def __init__(self, gateway: RigGateway, say: Callable[[str], None]) -> None:
         self._gateway, self._say, self._notice, self._lost = gateway, say, "", 0
+        self._kept: tuple[str, ...] = ()
 
     def __call__(self) -> tuple[str, ...]:
+        """What there is to say since the last call."""
+        self.look()
+        found, self._kept = self._kept, ()
+        return found
+
+    def look(self) -> None:
+        """Tell the person what is new, and keep it for the log, which goes on with the next block."""
         found = list(self._gateway.events())
         notice, lost = self._gateway.notice, self._gateway.dropped
         if notice != self._notice and notice:
@@ -231,16 +240,17 @@ class _Remarks:
         self._notice, self._lost = notice, lost
         for line in found:
             self._say(line)
-        return tuple(found)
+        self._kept = (*self._kept, *found)
 
 
 class _Silence:
     """Says once that the rig has fallen silent, and goes on waiting."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say, self.seconds = say, 0.0
+    def __init__(self, say: Callable[[str], None], remarks: _Remarks) -> None:
+        self._say, self._remarks, self.seconds = say, remarks, 0.0
 
     def __call__(self, seconds: float) -> None:
+        self._remarks.look()
         if seconds >= SILENT_S > self.seconds:
             self._say("the rig is silent; waiting for it, Ctrl-C ends")
         self.seconds = seconds
