@@ -17,6 +17,7 @@ from twin.station.confirm import WriteSidecarOption, YesOption, accept_recording
 from twin.station.fit import fit_app
 from twin.station.library import recordings_app
 from twin.station.report.command import report as file_report
+from twin.station.report.compare_command import compare
 from twin.station.terminal import (
     JsonOption,
     channel_options,
@@ -51,6 +52,10 @@ app.command(
     "report",
     epilog="Examples: atmd report runs/demo.rrd   ·   atmd report runs/demo.rrd --plot demo.pdf --json -",
 )(file_report)
+app.command(
+    epilog="Examples: atmd compare before.rrd after.rrd --html change.html   ·   "
+    "atmd compare runs/a.rrd runs/b.rrd runs/c.rrd --reference 2 --by time --json -"
+)(compare)
 
 
 class ControllerName(StrEnum):

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from twin.plant.errors import InputError
 
@@ -45,7 +44,9 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
         bar.stop()
 
 
-def report(result: dict[str, Any], table: Callable[[dict[str, Any]], Table], json_to: str | None) -> None:
+def report(
+    result: dict[str, Any], table: Callable[[dict[str, Any]], RenderableType], json_to: str | None
+) -> None:
     """Print a result as a table, and as JSON where it was asked for."""
     (Console() if json_to is None else people).print(table(result))
     if json_to is None:

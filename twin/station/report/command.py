@@ -98,7 +98,7 @@ def report_table(said: dict[str, Any]) -> Table:
     from twin.station.report.words import quantity, seconds, share
 
     v, h, f = said["verify"], said["hindsight"], said["figures"]
-    whole = {True: "whole", False: "[red]damaged[/]", None: "no checksums"}[v["whole"]]
+    whole = {True: "whole", False: "[red]not whole[/]", None: "no checksums"}[v["whole"]]
     table = Table(
         "figure", "limit", "worst seen", "when", "margin", "verdict",
         title=f"{said['setup']['file']}: {said['setup']['plant']}, {said['setup']['seconds']:.1f} s, {whole}",

@@ -126,7 +126,7 @@ def _setup(said: dict[str, Any]) -> Html:
     s, v = said["setup"], said["verify"]
     whole = {
         True: badge("whole", "good"),
-        False: badge("damaged", "bad"),
+        False: badge("not whole", "bad"),
         None: badge("no checksums", "open"),
     }[v["whole"]]
     files = join(

@@ -260,27 +260,38 @@ def _health(figure: Figure, run: Replayed) -> None:
     dress(low, "time [s]", "rms / expected [1]")
 
 
-def _timeline(figure: Figure, run: Replayed) -> None:
-    axes = figure.add_subplot()
+def lanes_of(run: Replayed) -> list[tuple[str, list[str]]]:
+    """State of control, damping learner and model, block by block."""
+    control = [
+        "unknown" if not np.isfinite(v) else "on" if v > 0.0 else "off" for v in run.tracks["control_on"]
+    ]
+    return [("control", control), ("damping", list(run.tracks.learner)), ("model", list(run.tracks.verdict))]
+
+
+def shade_states(axes: Axes, run: Replayed) -> dict[str, str]:
+    """Draw the lanes at 0, -1, -2; the states that occur with their colours."""
     t = run.tracks
     begin, end = t["time_s"] - t["duration_s"], t["time_s"]
-    control = ["unknown" if not np.isfinite(v) else "on" if v > 0.0 else "off" for v in t["control_on"]]
-    lanes = [("control", control), ("damping", list(run.tracks.learner)), ("model", list(run.tracks.verdict))]
     seen: dict[str, str] = {}
-    for row, (_, states) in enumerate(lanes):
+    for row, (_, states) in enumerate(lanes_of(run)):
         first = 0
         for k in range(1, len(states) + 1):
             if k == len(states) or states[k] != states[first]:
-                state = states[first]
-                axes.broken_barh(
-                    [(begin[first], end[k - 1] - begin[first])],
-                    (-row - 0.34, 0.68),
-                    color=STATES.get(state, "#78909c"),
-                    lw=0,
-                )
+                state, width = states[first], end[k - 1] - begin[first]
+                colour = STATES.get(state, "#78909c")
+                axes.broken_barh([(begin[first], width)], (-row - 0.34, 0.68), color=colour, lw=0)
                 if state:
-                    seen.setdefault(state, STATES.get(state, "#78909c"))
+                    seen.setdefault(state, colour)
                 first = k
+    axes.set_xlim(float(begin[0]), float(end[-1]))
+    return seen
+
+
+def _timeline(figure: Figure, run: Replayed) -> None:
+    axes = figure.add_subplot()
+    t = run.tracks
+    end = t["time_s"]
+    seen = shade_states(axes, run)
     masked = t["masked"] > 0.0
     marks = [
         ("events", [e["time_s"] for e in run.history.events if e["level"] == "info"], "#78909c", "|"),
@@ -291,14 +302,13 @@ def _timeline(figure: Figure, run: Replayed) -> None:
         ("commands", [c["sent_s"] for c in run.history.commands.values()], CONTROLLED, "D"),
         ("masked", [float(v) for v in end[masked]], LIMIT, "|"),
     ]
-    names = [name for name, _ in lanes]
+    names = [name for name, _ in lanes_of(run)]
     for name, times, colour, mark in marks:
         if name not in names:
             names.append(name)
         axes.plot(times, [-names.index(name)] * len(times), mark, color=colour, ms=6, ls="", label="_marks")
     axes.set_yticks([-k for k in range(len(names))], names)
     axes.set_ylim(-len(names) + 0.4, 0.6)
-    axes.set_xlim(float(begin[0]), float(end[-1]))
     for state, colour in seen.items():
         axes.plot([], [], color=colour, lw=5, label=state)
     dress(axes, "time [s]", "", legend=False)

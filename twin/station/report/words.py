@@ -13,10 +13,14 @@ def quantity(value: float | None, unit: str = "", std: float | None = None, digi
     if value is None or not math.isfinite(value):
         return "–"
     scale, prefix = prefix_for(value, unit)
-    known = std is not None and math.isfinite(std)
-    body = f"{value / scale:.{digits}g}"
-    if known and std is not None and std > 0.0:
-        body += f" ± {std / scale:.2g}"
+    scaled, known = value / scale, std is not None and math.isfinite(std) and std > 0.0
+    if known and std is not None and std < abs(value):
+        decimals = max(0, 1 - math.floor(math.log10(std / scale)))
+        body = f"{scaled:.{decimals}f} ± {std / scale:.{decimals}f}"
+    elif known and std is not None:
+        body = f"{scaled:.2g} ± {std / scale:.2g}"
+    else:
+        body = f"{scaled:.0f}" if 10.0**digits <= abs(scaled) < 1e7 else f"{scaled:.{digits}g}"
     shown = f"{prefix}{unit}" if unit not in ("", "1") else ""
     return f"{body} {shown}".rstrip()
 
