@@ -2,7 +2,8 @@
 
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,7 @@ from twin.station.terminal import (
     with_unit,
 )
 
-EXIT_INPUT, EXIT_RUN, EXIT_INTERRUPTED = 2, 3, 130
+EXIT_INPUT, EXIT_RUN = 2, 3
 
 app = typer.Typer(
     name="atmd",
@@ -128,16 +129,30 @@ DropOldestOption = Annotated[
 
 
 class Interrupted(BaseException):
-    """The person pressed Ctrl-C. Its own kind: the command-line library ends silently on KeyboardInterrupt."""
+    """The person pressed Ctrl-C, or the machine asks to end. Its own kind: the library ends silently on the usual."""
+
+    def __init__(self, signal_number: int = signal.SIGINT) -> None:
+        super().__init__()
+        self.exit_code = 128 + signal_number
 
 
-def _interrupt(_signal: int, _frame: object) -> NoReturn:
-    raise Interrupted
+def _interrupt(signal_number: int, _frame: object) -> NoReturn:
+    raise Interrupted(signal_number)
+
+
+@contextmanager
+def _until_stopped() -> Iterator[None]:
+    """For what runs until it is stopped: to be stopped is its proper end."""
+    try:
+        yield
+    except Interrupted:
+        say("stopped")
 
 
 def main() -> None:
     """Run a command; what the person's input or the rig did wrong ends in one message, not a traceback."""
-    signal.signal(signal.SIGINT, _interrupt)
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, _interrupt)
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -146,9 +161,9 @@ def main() -> None:
     except RunError as error:
         _complain(error)
         sys.exit(EXIT_RUN)
-    except Interrupted:
+    except Interrupted as stop:
         people.print("interrupted; what was recorded until here can be read", style="yellow")
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(stop.exit_code)
 
 
 def _complain(error: Exception) -> None:
@@ -518,23 +533,41 @@ def rig(
         typer.Option(min=0.0, max=100.0, help="1 keeps real time, 0 goes as fast as the station follows."),
     ] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the sensor noise.")] = 0,
+    daqmx: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Measure a real rig by an NI-DAQmx device instead; the file says which channel is where.",
+        ),
+    ] = None,
 ) -> None:
     """Run the simulated rig as a program of its own, until Ctrl-C or the end of its sweep.
 
     It speaks the protocol of a real rig, obeys commands at block boundaries, enforces its plant's limits whatever it
     is told, and switches its controller off 0.5 s after it last heard of its station.
+
+    With --daqmx the samples are those of a real rig, measured by an NI-DAQmx device; commands are refused, since its
+    controller is not here. See docs/daqmx.md.
     """
-    from twin.station.rig import RigOptions, rig_programme, serve
+    from twin.station.rig import RigOptions, rig_programme, serve, serve_device
 
     options = RigOptions(
         plant, keys, tuple(station), bind, port, pattern.value, *_two_hz("--band", band), seconds, amplitude,
         _two_hz("--control", control), high_pass_hz, speed, seed,
     )  # fmt: skip
+    if daqmx is not None:
+        device, measured = serve_device(options, daqmx)
+        say(f"rig of plant '{plant}', measured as {daqmx} says; its controller takes no orders from here")
+        say(f"samples on tcp://{bind}:{device.samples_port}, commands on tcp://{bind}:{device.commands_port}")
+        with closing(measured):
+            device.run()
+        return
     programme = rig_programme(options)
-    server = serve(options, programme)
+    server = serve(options, programme, say)
     say(f"rig '{programme.plant.name}' ({programme.plant.fingerprint}): {programme.sweep.description}")
     say(f"samples on tcp://{bind}:{server.samples_port}, commands on tcp://{bind}:{server.commands_port}")
-    server.run()
+    with _until_stopped():
+        server.run()
 
 
 @app.command(
@@ -567,7 +600,7 @@ def live(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="End after so much data, in s; else at Ctrl-C.")
     ] = None,
-    rotate: RotateOption = None,
+    rotate: RotateOption = "10min",  # what Rerun keeps of a file in memory grows until the file ends
     disk_budget: DiskBudgetOption = None,
     drop_oldest: DropOldestOption = False,
     json_to: JsonOption = None,
@@ -586,7 +619,8 @@ def live(
     must_be_writable(json_to)
 
     def end(_signal: int, _frame: object) -> NoReturn:
-        signal.signal(signal.SIGINT, _interrupt)  # a second one ends what the first did not
+        for ending in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(ending, _interrupt)  # a second one ends what the first did not
         raise LiveEnd
 
     options = LiveOptions(
@@ -594,7 +628,8 @@ def live(
         save if save is not None else Path("runs") / "live.rrd", web, view, bind, port, automatic, seconds,
         storage(rotate, disk_budget, drop_oldest=drop_oldest),
     )  # fmt: skip
-    signal.signal(signal.SIGINT, end)
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, end)
     try:
         result = run_live(options, say)
     except LiveEnd:

@@ -1,5 +1,7 @@
 """``atmd keys`` and ``atmd rig``: the simulated rig as a program of its own, for a station that connects to it."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -10,6 +12,7 @@ from tuning.rule import scheduling_rule
 from twin.plant.config import DampingTable, Plant, Shaker
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
+from twin.rig.daqmx import DaqmxRig
 from twin.rig.excitation import Shuttle, Sweep, Tone
 from twin.rig.keys import load_pair, load_public
 from twin.rig.process import warm_up
@@ -85,8 +88,15 @@ def rig_programme(options: RigOptions) -> Programme:
         raise InputError(f"plant '{plant.name}' cannot be run: {error}") from error
 
 
-def serve(options: RigOptions, programme: Programme) -> RigServer:
+def serve(
+    options: RigOptions, programme: Programme, say: Callable[[str], None] = lambda _: None
+) -> RigServer:
     """Bind a rig; `RigServer.run` runs it.
+
+    Parameters
+    ----------
+    say
+        Takes lines for the person: who has the controls, and what was refused.
 
     Raises
     ------
@@ -111,7 +121,36 @@ def serve(options: RigOptions, programme: Programme) -> RigServer:
         samples_port=options.port,
         commands_port=options.port + 1 if options.port else 0,
         stands_alone=True,
+        say=say,
     )
+
+
+def serve_device(options: RigOptions, setup: Path) -> tuple[RigServer, DaqmxRig]:
+    """Bind a rig that an NI-DAQmx device measures; `RigServer.run` runs it, then close the rig. It obeys no command.
+
+    Raises
+    ------
+    InputError
+        If keys, package, driver or device are missing, the file does not fit the plant, or the ports are taken.
+    """
+    keys = load_pair(options.keys)
+    stations = [load_public(path) for path in options.stations]
+    rig = DaqmxRig(load_plant(options.plant), setup)
+    try:
+        server = RigServer(
+            rig,
+            keys,
+            stations,
+            math.inf,  # the device's clock sets the pace
+            host=options.host,
+            samples_port=options.port,
+            commands_port=options.port + 1 if options.port else 0,
+            stands_alone=True,
+        )
+    except InputError:
+        rig.close()
+        raise
+    return server, rig
 
 
 def _excitation(options: RigOptions, plant: Plant) -> Sweep | Shuttle | Tone:
