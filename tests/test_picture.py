@@ -13,7 +13,7 @@ from twin.plant.files import load_plant
 from twin.rig.recording import Recorder
 from twin.station import picture
 from twin.station.picture import save_picture
-from twin.station.rerun_view import RerunView
+from twin.station.rerun_view import KEPT, RerunView
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             sample_rate_hz=RATE,
             channels=channels(plant),
             schedule=schedule(),
-            hold_blocks=10,
-            follow=False,
+            pace=KEPT,
         )
         for frame in frames(plant, 6.0):
             recorder.write_block(frame.block)

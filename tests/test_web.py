@@ -153,9 +153,9 @@ def test_a_browser_draws_the_run_and_asks_nobody_else(
     url, stream = served
     plant = load_plant("rig")
     view = RerunView(
-        stream, plant=plant, sample_rate_hz=RATE, channels=channels(plant), schedule=schedule(), hold_blocks=5
+        stream, plant=plant, sample_rate_hz=RATE, channels=channels(plant), schedule=schedule()
     )
-    live = LiveView(view, depth=100, keep_stream=True)
+    live = LiveView(view, depth=100)
     for frame in frames(plant, 6.0):
         live.show(frame)
     live.close(10.0)

@@ -5,89 +5,99 @@ from dataclasses import dataclass
 import rerun.blueprint as rrb
 
 from twin.plant.config import Plant
+from twin.station import curve_plot
 from twin.station.columns import TIMELINE
-from twin.station.curve_plot import HEIGHT, WIDTH
+from twin.station.view import spectrum_plot
+from twin.station.view.schematic import ROOT as SCHEMATIC
 
-_WAVEFORM_S = 0.12
+WAVEFORM_S = 0.12
+_BACKGROUND = [13, 16, 17]
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What the arrangement depends on: the plant, (path, name) of the waveform plots, windows, following."""
+    """What the arrangement depends on.
+
+    Attributes
+    ----------
+    waveforms
+        (path, name) of every plot.
+    spectrum
+        Name and unit of the channel whose spectrum is shown; empty if there is none.
+    bounds
+        Ranges of x and y of the schematic.
+    trend_s, follow
+        As of `twin.station.rerun_view.Pace`.
+    """
 
     plant: Plant
     waveforms: tuple[tuple[str, str], ...]
+    spectrum: str
+    bounds: tuple[tuple[float, float], tuple[float, float]]
     trend_s: float | None
     follow: bool
 
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
-    """Arrange the views for about 1600 x 1000 pixels."""
+    """Arrange the views for about 1600 x 1000 pixels: lanes on top, then three columns.
+
+    On the left the machine itself, in the middle how it goes against limits and model, on the right what is behind it.
+    """
     primary = layout.plant.primary.name
     trend = None if layout.trend_s is None else _window(layout.trend_s)
     has_coil = layout.plant.voice_coil is not None
 
-    lanes = rrb.StateTimelineView(origin="state", name="State of control, damping learner, model")
-    vibration = _trend("vibration", f"Vibration of the {primary} at the excitation [µm]", trend)
-    waveforms = [
-        _waveform(path, f"{name}: measured and twin" if k == 0 else name)
-        for k, (path, name) in enumerate(layout.waveforms)
-    ]
-    estimates = [_waveform("estimate/primary", f"{primary} displacement, estimated [µm]")]
-    if layout.plant.absorber is not None:
-        estimates.append(_waveform("estimate/stroke", "stroke, estimated [mm]"))
-    waves = rrb.Tabs(*waveforms, *estimates, active_tab=0, name="Waveforms")
+    lanes = rrb.StateTimelineView(
+        origin="state", name="Alarms, control, damping learner, model", time_ranges=trend
+    )
+    schematic = rrb.Spatial2DView(
+        origin=SCHEMATIC,
+        name="The rig in slow motion, enlarged: motion estimated, forces and current",
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=layout.bounds[0], y_range=layout.bounds[1]),
+    )
+    waves = rrb.Tabs(*_waveforms(layout), active_tab=0, name="Waveforms")
     health = rrb.Tabs(
         _trend("health/nis", "Model health: NIS, 1 = consistent", trend),
         _trend("health/innovation", "Innovations", trend),
-        _trend("health/bias", "Bias of innovations", trend),
-        _trend("health/whiteness", "Whiteness of innovations", trend),
+        _trend("health/bias", "Bias", trend),
+        _trend("health/whiteness", "Whiteness", trend),
         active_tab=0,
         name="Model health",
     )
     excitation = _trend("excitation", "Excitation [Hz]", trend)
     log = rrb.TextLogView(
         origin="log",
-        name="Events and decisions",
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
+        name="Events, alarms, decisions",
+        columns=rrb.TextLogColumns(
+            # The time is part of the text: the column is too narrow to show it.
+            timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)],
+            text_log_columns=["loglevel", "body"],
+        ),
     )
-    setup = rrb.TextDocumentView(origin="setup", name="Set-up")
-    gains = rrb.Vertical(
-        *(_trend(f"gains/{g}", f"Gain {g}", trend) for g in ("gamma_n_m", "beta_ns_m", "alpha_kg")),
-        name="Gains",
+    words = rrb.Tabs(log, rrb.TextDocumentView(origin="setup", name="Set-up"), active_tab=0)
+    spectrum = (
+        _spectrum(layout.spectrum) if layout.spectrum else _trend("excitation", "Excitation [Hz]", trend)
     )
     if has_coil:
+        vibration = _trend("vibration", f"Vibration of the {primary} at the excitation [µm]", trend)
         power = _trend("power", "Coil power against budget [W]", trend)
-        at_excitation = rrb.TimeSeriesView(
-            origin="damping",
-            contents=["/damping/learned", "/damping/in_use"],
-            name="Coil damping c2 at the excitation [Ns/m]",
-            time_ranges=trend,
-            plot_legend=_legend(trend),
-        )
-        curve = rrb.Spatial2DView(
-            origin="damping/curve",
-            name="c2 [Ns/m] over f [Hz]: learned ±1σ green, in use white",
-            background=[13, 16, 17],
-            visual_bounds=rrb.VisualBounds2D(x_range=[-12.0, WIDTH + 6.0], y_range=[-HEIGHT - 6.0, 12.0]),
-        )
-        body = rrb.Vertical(
-            rrb.Horizontal(vibration, waves, column_shares=[3, 2]),
-            rrb.Horizontal(power, curve, at_excitation, column_shares=[1, 1, 1]),
-            rrb.Horizontal(
-                health, rrb.Tabs(excitation, gains, active_tab=0), rrb.Tabs(log, setup, active_tab=0),
-                column_shares=[1, 1, 1],
-            ),
-            row_shares=[5, 4, 3.5],
-        )  # fmt: skip
+        left = rrb.Vertical(schematic, spectrum, words, row_shares=[5, 5, 3.4])
+        middle = rrb.Vertical(vibration, power, health, row_shares=[5, 5, 3.4])
+        behind = rrb.Tabs(excitation, _gains(trend), active_tab=0)
+        right = rrb.Vertical(waves, _damping(trend), behind, row_shares=[5, 5, 3.4])
+        body = rrb.Horizontal(left, middle, right, column_shares=[1, 1, 1])
     else:
-        body = rrb.Vertical(
-            rrb.Horizontal(vibration, waves, column_shares=[3, 2]),
-            rrb.Horizontal(health, excitation, rrb.Tabs(log, setup, active_tab=0)),
-            row_shares=[1, 1],
+        left = rrb.Vertical(schematic, spectrum, row_shares=[1, 1])
+        right = rrb.Vertical(
+            waves,
+            rrb.Horizontal(health, excitation) if layout.spectrum else health,
+            words,
+            row_shares=[5, 5, 3.4],
         )
+        body = rrb.Horizontal(left, right, column_shares=[1, 1.3])
     return rrb.Blueprint(
-        rrb.Vertical(lanes, body, row_shares=[2.5, 10]),
+        rrb.Vertical(lanes, body, row_shares=[2.95, 10]),
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -96,6 +106,55 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
         ),
         auto_layout=False,
         auto_views=False,
+    )
+
+
+def _waveforms(layout: Layout) -> list[rrb.TimeSeriesView]:
+    views = [
+        _waveform(path, f"{name}: measured, twin" if k == 0 else name)
+        for k, (path, name) in enumerate(layout.waveforms)
+    ]
+    views.append(_waveform("estimate/primary", f"{layout.plant.primary.name} estimated [µm]"))
+    if layout.plant.absorber is not None:
+        views.append(_waveform("estimate/stroke", "stroke estimated [mm]"))
+    return views
+
+
+def _damping(trend: rrb.VisibleTimeRange | None) -> rrb.Tabs:
+    curve = rrb.Spatial2DView(
+        origin=curve_plot.ROOT,
+        name="c2 [Ns/m] over f [Hz]: learned ±1σ, in use",
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[-12.0, curve_plot.WIDTH + 6.0], y_range=[-curve_plot.HEIGHT - 6.0, 12.0]
+        ),
+    )
+    at_excitation = rrb.TimeSeriesView(
+        origin="damping",
+        contents=["/damping/learned", "/damping/in_use"],
+        name="c2 at the excitation",
+        time_ranges=trend,
+        plot_legend=_legend(trend),
+    )
+    return rrb.Tabs(curve, at_excitation, active_tab=0, name="Coil damping")
+
+
+def _spectrum(name: str) -> rrb.Spatial2DView:
+    p = spectrum_plot
+    return rrb.Spatial2DView(
+        origin=p.ROOT,
+        name=f"Spectrum and waterfall over f [Hz]: {name}",
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[-26.0, p.BINS + 8.0], y_range=[-p.SPACE - p.HEIGHT - 8.0, p.ROWS + 3.0]
+        ),
+    )
+
+
+def _gains(trend: rrb.VisibleTimeRange | None) -> rrb.Horizontal:
+    return rrb.Horizontal(
+        *(_trend(f"gains/{g}", f"Gain {g}", trend) for g in ("gamma_n_m", "beta_ns_m", "alpha_kg")),
+        name="Gains",
     )
 
 
@@ -120,6 +179,6 @@ def _waveform(origin: str, name: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        time_ranges=_window(_WAVEFORM_S),
+        time_ranges=_window(WAVEFORM_S),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )

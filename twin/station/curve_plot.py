@@ -11,6 +11,7 @@ import rerun as rr
 from estimators.types import DampingCurve
 from twin.plant.linear import Array
 from twin.station import palette
+from twin.station.view.scales import tick_step, ticks
 
 WIDTH, HEIGHT = 160.0, 64.0
 ROOT = "damping/curve"
@@ -42,14 +43,14 @@ def axes_for(curve: DampingCurve, previous: Axes | None) -> Axes:
         and (0.4 * previous.top_ns_m < reach <= previous.top_ns_m)
     ):
         return previous
-    step = _tick(1.2 * reach, 5)
+    step = tick_step(1.2 * reach, 5)
     return Axes(low, high, float(np.ceil(1.2 * reach / step) * step))
 
 
 def log_axes(stream: rr.RecordingStream, axes: Axes) -> None:
     """Grid lines and tick labels."""
-    hz = _ticks(axes.low_hz, axes.high_hz, 7)
-    ns_m = _ticks(0.0, axes.top_ns_m, 4)
+    hz = ticks(axes.low_hz, axes.high_hz, 7)
+    ns_m = ticks(0.0, axes.top_ns_m, 4)
     upright = [axes.place(np.array([f, f]), np.array([0.0, axes.top_ns_m])) for f in hz]
     level = [axes.place(np.array([axes.low_hz, axes.high_hz]), np.array([c, c])) for c in ns_m]
     stream.log(
@@ -98,15 +99,3 @@ def log_curve(
         f"{ROOT}/excitation",
         rr.LineStrips2D([at], colors=palette.MEASURED, radii=rr.Radius.ui_points(1.0), draw_order=5.0),
     )
-
-
-def _tick(span: float, wanted: int) -> float:
-    """Step of 1, 2 or 5 times a power of ten that divides a span into about so many."""
-    raw = span / wanted
-    power = 10.0 ** np.floor(np.log10(raw))
-    return float(min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda s: abs(s - raw)))
-
-
-def _ticks(low: float, high: float, wanted: int) -> Array:
-    step = _tick(high - low, wanted)
-    return np.arange(round(np.ceil(low / step - 1e-9)), round(np.floor(high / step + 1e-9)) + 1) * step

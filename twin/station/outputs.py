@@ -15,13 +15,11 @@ from twin.rig.recording import APPLICATION, Recorder
 from twin.rig.storage import Storage, part_path, parts_beside
 from twin.station.answers import note, software
 from twin.station.frame import Frame
-from twin.station.live import LiveView, NativeViewer
-from twin.station.rerun_view import RerunView
+from twin.station.live import LiveView
+from twin.station.native import Broadcast, NativeViewer, ViewerKeeper
+from twin.station.rerun_view import KEPT, WATCHED, Pace, RerunView
 from twin.station.session import Session
 from twin.station.web import WebViewer
-
-FILE_HOLD_BLOCKS = 10
-LIVE_TREND_S = 30.0
 
 
 def has_display() -> bool:
@@ -89,7 +87,8 @@ class Outputs:
         self.recorder: Recorder | None = None
         self._file_view: RerunView | None = None
         self.live: LiveView | None = None
-        self._viewer: NativeViewer | None = None
+        self._keeper: ViewerKeeper | None = None
+        self._stream: rr.RecordingStream | None = None
         self._web: WebViewer | None = None
         self.url = ""
         self.moved_aside: Path | None = None
@@ -112,24 +111,15 @@ class Outputs:
             if web:
                 self._web = WebViewer(stream)
                 self.url = self._web.start()
-            else:
-                self._viewer = NativeViewer()
-                stream.connect_grpc(self._viewer.start())
-            self.live = LiveView(
-                self._view(stream, trend_s=LIVE_TREND_S), keep_stream=web, viewer=self._viewer
-            )
+            source = self._web.source if self._web is not None else Broadcast(stream).url
+            self._keeper = ViewerKeeper(NativeViewer(), source) if window else None
+            self._stream = stream
+            self.live = LiveView(self._view(stream, WATCHED), keeper=self._keeper)
 
     def _new_file_view(self, recorder: Recorder) -> RerunView:
-        return self._view(recorder.stream, hold_blocks=FILE_HOLD_BLOCKS, follow=False)
+        return self._view(recorder.stream, KEPT)
 
-    def _view(
-        self,
-        stream: rr.RecordingStream,
-        *,
-        hold_blocks: int = 1,
-        trend_s: float | None = None,
-        follow: bool = True,
-    ) -> RerunView:
+    def _view(self, stream: rr.RecordingStream, pace: Pace) -> RerunView:
         session = self._session
         return RerunView(
             stream,
@@ -137,10 +127,9 @@ class Outputs:
             sample_rate_hz=session.observer.sample_rate_hz,
             channels=session.channels,
             schedule=session.schedule,
+            budget_kind=session.settings.goal.budget_kind,
             setup=self._setup,
-            hold_blocks=hold_blocks,
-            trend_s=trend_s,
-            follow=follow,
+            pace=pace,
         )
 
     def take(self, frame: Frame) -> None:
@@ -219,3 +208,5 @@ class Outputs:
                 self.live.close()
             if self._web is not None:
                 self._web.stop()
+            elif self._stream is not None:
+                self._stream.disconnect()

@@ -20,7 +20,7 @@ from twin.rig.recorded import open_recording
 from twin.rig.recording import ROOT
 from twin.rig.rerun_tool import rerun_environment, rerun_program
 from twin.station import palette
-from twin.station.live import NativeViewer
+from twin.station.native import NativeViewer
 from twin.station.series import Series, read_series
 
 _TIMEOUT_S = 60.0

@@ -1,37 +1,68 @@
-"""What people see of a run: frames turned into Rerun series, lanes, curves and text.
+"""What people see of a run: frames turned into Rerun series, drawings, lanes, curves and text.
 
 Everything is on one timeline, ``time`` since the start of the recording. Raw data is not written here; the
 recorder keeps it (``/record``).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 
 from estimators.types import StateEstimate
+from tuning.types import BudgetKind
 from twin.control.schedule import Command, GainSchedule
 from twin.plant.blocks import Channel
-from twin.plant.config import MOTION_UNITS, Plant
+from twin.plant.config import Plant
 from twin.plant.linear import Array
-from twin.station import palette
+from twin.station.alarms import AlarmWatch
 from twin.station.blueprint import Layout, blueprint
 from twin.station.columns import TIMELINE, Columns, nanoseconds
 from twin.station.curve_plot import Axes, axes_for, log_axes, log_curve
 from twin.station.frame import ROUTINE, Frame
+from twin.station.view.groups import groups_of, spectrum_column
+from twin.station.view.schematic import Schematic
+from twin.station.view.spectrum_plot import SpectrumPlot
+from twin.station.view.styles import log_styles
 
 SHOWN_HZ = 1000.0
-_CURVE_PERIOD_S = 0.5
 _MICRO, _MILLI = 1e6, 1e3
+_BAND_95 = 1.96
+
+REPEAT_S = 60.0
+"""What is said when it changes is said again so often, for a viewer that has come since and does not have it all."""
 
 
-@dataclass(slots=True)
-class _Group:
-    """Channels of one unit that share a plot; ``twin`` holds their names as sensors."""
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How much of a run is shown, and how often.
 
-    path: str
-    channels: list[int] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
+    Attributes
+    ----------
+    hold_blocks, hold_slow_blocks
+        Blocks to collect before series are sent: those of many samples, and those of one per block.
+    trend_s
+        Width of the window in which slow quantities are shown [s]; None for the whole run.
+    follow
+        Whether the viewer keeps up with the end of the data.
+    spectrum_s, curve_s, image_s
+        Time between spectra, between curves of the damping, and between images of the waterfall [s].
+    """
+
+    hold_blocks: int
+    hold_slow_blocks: int
+    trend_s: float | None
+    follow: bool
+    spectrum_s: float
+    curve_s: float
+    image_s: float
+
+
+WATCHED = Pace(1, 5, trend_s=30.0, follow=True, spectrum_s=0.1, curve_s=0.5, image_s=0.5)
+"""For people who look on as it happens."""
+
+KEPT = Pace(50, 50, trend_s=None, follow=False, spectrum_s=1.0, curve_s=1.0, image_s=5.0)
+"""For a file that is looked at afterwards."""
 
 
 class RerunView:
@@ -45,14 +76,12 @@ class RerunView:
         Of the run.
     schedule
         The controller's schedule at the start, from which the gains in use follow; None if unknown.
+    budget_kind
+        Which power the budget bounds, at the start.
     setup
         Markdown about the run, shown as it is.
-    hold_blocks
-        Blocks to collect before series are sent: 1 for people who watch, more for a file.
-    trend_s
-        Width of the window in which slow quantities are shown [s]; None for the whole run.
-    follow
-        Whether the viewer keeps up with the end of the data.
+    pace
+        `WATCHED` or `KEPT`.
     """
 
     def __init__(
@@ -63,55 +92,90 @@ class RerunView:
         sample_rate_hz: float,
         channels: tuple[Channel, ...],
         schedule: GainSchedule | None = None,
+        budget_kind: BudgetKind = "joule_mean",
         setup: str = "",
-        hold_blocks: int = 1,
-        trend_s: float | None = None,
-        follow: bool = True,
+        pace: Pace = WATCHED,
     ) -> None:
-        self._stream = stream
-        self._plant = plant
+        self._stream, self._plant, self._channels, self._pace = stream, plant, channels, pace
         self._step = max(1, int(sample_rate_hz // SHOWN_HZ))
-        self._channels = channels
         self._schedule = schedule
+        self._alarms = AlarmWatch(plant, budget_kind)
         self._sent: dict[int, Command] = {}
-        self._columns = Columns(stream)
-        self._hold, self._held = hold_blocks, 0
+        self._fast, self._slow = Columns(stream, pace.hold_blocks), Columns(stream, pace.hold_slow_blocks)
         self._lanes: dict[str, str] = {}
         self._axes: Axes | None = None
         self._curve_at_s = -np.inf
-        self._groups = _groups(plant, channels)
-        self._layout = Layout(
+        self._repeat_at_s = REPEAT_S
+        self._groups = groups_of(plant, channels)
+        self._schematic = Schematic(stream, self._fast, plant)
+        self._spectral = spectrum_column(plant, channels)
+        self._spectrum: SpectrumPlot | None = None
+        spectrum_name = ""
+        if self._spectral is not None:
+            channel = channels[self._spectral]
+            spectrum_name = f"{channel.name} [{channel.unit}]"
+            self._spectrum = SpectrumPlot(
+                stream, sample_rate_hz, _top_hz(plant), whole=pace.trend_s is None,
+                line_s=pace.spectrum_s, image_s=pace.image_s,
+            )  # fmt: skip
+        layout = Layout(
             plant=plant,
             waveforms=tuple((g.path, g.path.removeprefix("waveform/")) for g in self._groups),
-            trend_s=trend_s,
-            follow=follow,
+            spectrum=spectrum_name,
+            bounds=self._schematic.bounds,
+            trend_s=pace.trend_s,
+            follow=pace.follow,
         )
-        self._log_static(setup)
+        stream.send_blueprint(blueprint(layout))
+        text = rr.TextDocument(setup or describe(plant), media_type=rr.MediaType.MARKDOWN)
+        stream.log("setup", text, static=True)
+        log_styles(stream, plant, channels, self._groups, budget_kind)
 
     def show(self, frame: Frame) -> None:
         """Add one frame."""
         end = np.array([frame.block.end_s])
+        if self._pace.trend_s is not None and frame.block.end_s >= self._repeat_at_s:
+            self._repeat(frame.block.end_s)
         self._show_waveforms(frame)
         self._show_estimate(frame)
+        self._schematic.add(frame)
+        self._show_spectrum(frame)
         self._show_health(frame, end)
         self._show_performance(frame, end)
         self._show_damping(frame, end)
         self._show_gains(frame, end)
-        self._show_lanes(frame)
         self._show_text(frame)
-        self._held += 1
-        if self._held >= self._hold:
-            self.send()
+        self._show_lanes(frame)
+        self._fast.end_block()
+        self._slow.end_block()
 
     def send(self) -> None:
         """Send what is held back; at the end of a run."""
-        self._held = 0
-        self._columns.send()
+        self._fast.send()
+        self._slow.send()
 
     def disconnect(self) -> None:
         """Send what is held back and let go of the stream; for one that only this view uses."""
         self.send()
         self._stream.disconnect()
+
+    def _repeat(self, now_s: float) -> None:
+        self._repeat_at_s = now_s + REPEAT_S
+        self._lanes.clear()
+        self._axes = None
+        self._schematic.repeat()
+        if self._spectrum is not None:
+            self._spectrum.repeat()
+
+    def _show_spectrum(self, frame: Frame) -> None:
+        if self._spectrum is None or self._spectral is None:
+            return
+        block, name = frame.block, self._channels[self._spectral].name
+        measured = np.where(block.valid[:, self._spectral], block.values[:, self._spectral], np.nan)
+        sensors = frame.estimate.sensors
+        twin = frame.twin[:, sensors.index(name)] if name in sensors else np.zeros(block.n_samples)
+        hz = None if frame.phasors is None else frame.phasors.frequency_hz
+        self._spectrum.add(block.end_s, np.column_stack([measured, twin]), hz)
 
     def _show_waveforms(self, frame: Frame) -> None:
         block = frame.block
@@ -122,8 +186,8 @@ class RerunView:
         nothing = np.full(len(time_s), np.nan)
         for group in self._groups:
             series = [measured[:, c] for c in group.channels]
-            series += [frame.twin[rows, modelled[n]] if n in modelled else nothing for n in group.names]
-            self._columns.add(group.path, time_s, np.column_stack(series))
+            series += [frame.twin[rows, modelled[n]] if n in modelled else nothing for n in group.twin]
+            self._fast.add(group.path, time_s, np.column_stack(series))
 
     def _show_estimate(self, frame: Frame) -> None:
         block, estimate = frame.block, frame.estimate
@@ -132,7 +196,7 @@ class RerunView:
         for path, weights, scale in self._estimated(estimate):
             mean = estimate.mean[rows] @ weights * scale
             variance = max(0.0, float(weights @ estimate.covariance @ weights)) * scale**2
-            self._columns.add(path, time_s, mean[:, None], np.full((len(mean), 1), variance))
+            self._fast.add(path, time_s, mean[:, None], np.full((len(mean), 1), variance))
 
     def _estimated(self, estimate: StateEstimate) -> list[tuple[str, Array, float]]:
         """Paths, rows over the states, and display scale of the displacements worth looking at."""
@@ -152,28 +216,37 @@ class RerunView:
         return found
 
     def _show_health(self, frame: Frame, end: Array) -> None:
+        """Innovations against what the filter expects of them, with the bounds that 95 of 100 keep."""
         estimate = frame.estimate
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate.innovation_rms / estimate.innovation_std
-        self._columns.add("health/innovation", end, ratio[None, :])
-        self._columns.add("health/nis", end, np.array([[estimate.nis, *frame.health.nis_band]]))
-        with np.errstate(invalid="ignore", divide="ignore"):
             bias = estimate.innovation_mean / estimate.innovation_std
-        self._columns.add("health/bias", end, bias[None, :])
-        self._columns.add("health/whiteness", end, estimate.innovation_lag1[None, :])
+        n = max(1.0, float(np.median(estimate.innovation_count)))
+        band = _BAND_95 / np.sqrt(n)
+        half = band / np.sqrt(2.0)
+        for name, values, low, high in (
+            ("innovation", ratio, 1.0 - half, 1.0 + half),
+            ("bias", bias, -band, band),
+            ("whiteness", estimate.innovation_lag1, -band, band),
+        ):
+            self._slow.add(f"health/{name}", end, np.array([[*values, low, high]]))
+        self._slow.add("health/nis", end, np.array([[estimate.nis, *frame.health.nis_band]]))
 
     def _show_performance(self, frame: Frame, end: Array) -> None:
         if frame.phasors is not None:
             hz, std = frame.phasors.frequency_hz, frame.phasors.frequency_std_hz
-            self._columns.add("excitation", end, np.array([[hz]]), np.array([[std**2]]))
+            self._slow.add("excitation", end, np.array([[hz]]), np.array([[std**2]]))
+        if frame.force_n is not None:
+            force, force_std = frame.force_n
+            self._slow.add("estimate/force", end, np.array([[force]]), np.array([[force_std**2]]))
         if frame.performance is None:
             return
         p = frame.performance
         shown = np.array([[p.displacement_m, p.passive_m, p.limit_m]]) * _MICRO
-        self._columns.add("vibration", end, shown)
+        self._slow.add("vibration", end, shown)
         powers = p.powers
         watts = [powers.electrical_mean_w, powers.joule_mean_w, powers.joule_peak_w, p.budget_w]
-        self._columns.add("power", end, np.array([watts]))
+        self._slow.add("power", end, np.array([watts]))
 
     def _show_damping(self, frame: Frame, end: Array) -> None:
         curve = frame.curve
@@ -183,9 +256,9 @@ class RerunView:
         if hz is not None:
             grid = curve.frequency_hz
             learned, std = np.interp(hz, grid, curve.damping_ns_m), np.interp(hz, grid, curve.std_ns_m)
-            self._columns.add("damping/learned", end, np.array([[learned]]), np.array([[std**2]]))
-            self._columns.add("damping/in_use", end, np.array([[np.interp(hz, grid, curve.in_use_ns_m)]]))
-        if frame.block.end_s < self._curve_at_s + _CURVE_PERIOD_S:
+            self._slow.add("damping/learned", end, np.array([[learned]]), np.array([[std**2]]))
+            self._slow.add("damping/in_use", end, np.array([[np.interp(hz, grid, curve.in_use_ns_m)]]))
+        if frame.block.end_s < self._curve_at_s + self._pace.curve_s:
             return
         self._curve_at_s = frame.block.end_s
         self._at(frame.block.end_s)
@@ -205,15 +278,25 @@ class RerunView:
             return
         gains = self._schedule.at(frame.phasors.frequency_hz)
         for name in ("gamma_n_m", "beta_ns_m", "alpha_kg"):
-            self._columns.add(f"gains/{name}", end, np.array([[getattr(gains, name)]]))
+            self._slow.add(f"gains/{name}", end, np.array([[getattr(gains, name)]]))
 
     def _show_lanes(self, frame: Frame) -> None:
+        if (
+            frame.ordered is not None
+            and frame.ordered.order is not None
+            and frame.ordered.order.goal is not None
+        ):
+            self._alarms.kind = frame.ordered.order.goal.budget_kind
         on = frame.block.control_on
+        alarm, words = self._alarms.take(frame.performance)
         now = {
+            "alarm": alarm,
             "control": "unknown" if on is None else "on" if on else "off",
             "damping": "none" if frame.curve is None else frame.curve.status,
             "model": frame.health.verdict,
         }
+        if words and self._lanes.get("alarm") != alarm:
+            self._say(frame.block.end_s, f"{alarm}: {words}", "ERROR" if alarm == "at a limit" else "WARN")
         for lane, state in now.items():
             if self._lanes.get(lane) != state:
                 self._lanes[lane] = state
@@ -238,98 +321,10 @@ class RerunView:
 
     def _say(self, time_s: float, text: str, level: str) -> None:
         self._at(time_s)
-        self._stream.log("log", rr.TextLog(text, level=level))
+        self._stream.log("log", rr.TextLog(f"{time_s:.1f} s  {text}", level=level))
 
     def _at(self, time_s: float) -> None:
         self._stream.set_time(TIMELINE, duration=nanoseconds(time_s)[0])
-
-    def _log_static(self, setup: str) -> None:
-        stream = self._stream
-        stream.send_blueprint(blueprint(self._layout))
-        stream.log(
-            "setup",
-            rr.TextDocument(setup or describe(self._plant), media_type=rr.MediaType.MARKDOWN),
-            static=True,
-        )
-        units = {c.name: c.unit for c in self._channels}
-        for group in self._groups:
-            measured = [self._channels[c].name for c in group.channels]
-            names = [f"{n} measured [{units[n]}]" for n in measured]
-            names += [f"{n} twin [{units[n]}]" for n in group.names]
-            n_pairs = len(measured)
-            colours = (
-                [palette.MEASURED, palette.TWIN]
-                if n_pairs == len(group.names) == 1
-                else [palette.SERIES[k % len(palette.SERIES)] for k in range(len(names))]
-            )
-            _lines(stream, group.path, names, colours, [2.0] * n_pairs + [1.2] * len(group.names))
-        primary = self._plant.primary.name
-        _lines(
-            stream,
-            "vibration",
-            ["measured [µm]", "model, no control [µm]", "limit of any controller [µm]"],
-            [palette.MEASURED, palette.PASSIVE, palette.LIMIT],
-            [2.5, 1.5, 1.5],
-        )
-        _lines(
-            stream,
-            "power",
-            ["electrical mean [W]", "Joule mean [W]", "Joule peak [W]", "budget (Joule mean) [W]"],
-            [palette.MEASURED, palette.TWIN, palette.SERIES[2], palette.LIMIT],
-            [2.0, 2.0, 1.5, 2.5],
-        )
-        sensors = [s.name for s in self._plant.sensor]
-        colours = [palette.SERIES[k % len(palette.SERIES)] for k in range(len(sensors))]
-        _lines(
-            stream,
-            "health/innovation",
-            [f"{s} rms/expected [1]" for s in sensors],
-            colours,
-            [1.0] * len(sensors),
-        )
-        for path, what in (("health/bias", "mean/std"), ("health/whiteness", "lag-1 autocorrelation")):
-            names = [f"{s} {what} [1]" for s in sensors]
-            _lines(stream, path, names, colours, [1.0] * len(sensors))
-        _lines(
-            stream,
-            "health/nis",
-            ["NIS [1]", "95 % from", "95 % to"],
-            [palette.IN_USE, palette.GOOD, palette.GOOD],
-            [2.5, 1.5, 1.5],
-        )
-        _lines(stream, "damping/in_use", ["c2 in use [Ns/m]"], [palette.IN_USE], [2.0])
-        _band(stream, "damping/learned", "c2 learned ±1σ", "Ns/m", palette.LEARNED)
-        _band(stream, "excitation", "excitation ±1σ", "Hz", palette.TWIN)
-        _band(stream, "estimate/primary", f"{primary} displacement ±1σ", "µm", palette.TWIN)
-        _band(stream, "estimate/stroke", "stroke ±1σ", "mm", palette.SERIES[2])
-        for path, name, colour in (
-            ("gains/gamma_n_m", "γ, relative position [N/m]", palette.MEASURED),
-            ("gains/beta_ns_m", "β, relative velocity [Ns/m]", palette.TWIN),
-            ("gains/alpha_kg", "α, relative acceleration [kg]", palette.SERIES[2]),
-        ):
-            _lines(stream, path, [name], [colour], [2.0])
-        _lane(stream, "control", {"on": palette.GOOD, "off": palette.OFF, "unknown": palette.OFF})
-        _lane(
-            stream,
-            "damping",
-            {
-                "none": palette.OFF,
-                "unestimated": palette.OFF,
-                "learning": palette.WAITING,
-                "estimated": palette.GOOD,
-                "invalid": palette.POOR,
-            },
-        )
-        _lane(
-            stream,
-            "model",
-            {
-                "consistent": palette.GOOD,
-                "drifting": palette.WARNING,
-                "diverged": palette.POOR,
-                "no data": palette.OFF,
-            },
-        )
 
 
 def describe(plant: Plant) -> str:
@@ -344,43 +339,9 @@ def describe(plant: Plant) -> str:
     return "\n".join([*lines, "", f"configuration `{plant.fingerprint}`"])
 
 
-def _groups(plant: Plant, channels: tuple[Channel, ...]) -> list[_Group]:
-    """Plots of waveforms: the primary body's motion by itself, everything else by unit."""
-    sensors = {s.name: s for s in plant.sensor}
-    motion = set(MOTION_UNITS.values())
-    groups: dict[str, _Group] = {}
-    for column, channel in enumerate(channels):
-        sensor = sensors.get(channel.name)
-        if sensor is not None and channel.unit in motion and sensor.of == plant.primary.name:
-            key = plant.primary.name
-        else:
-            key = {
-                "m/s²": "acceleration",
-                "m/s": "velocity",
-                "m": "displacement",
-                "A": "current",
-                "V": "voltage",
-            }.get(channel.unit, "force" if channel.unit == "N" else "other")
-        group = groups.setdefault(key, _Group(f"waveform/{key}"))
-        group.channels.append(column)
-        if sensor is not None:
-            group.names.append(channel.name)
-    return list(groups.values())
-
-
-def _lines(
-    stream: rr.RecordingStream, path: str, names: list[str], colours: list[int], widths: list[float]
-) -> None:
-    stream.log(path, rr.SeriesLines(names=names, colors=palette.array(colours), widths=widths), static=True)
-
-
-def _band(stream: rr.RecordingStream, path: str, name: str, unit: str, colour: int) -> None:
-    style = rr.Measurements.from_fields(
-        names=[name], units=[unit], colors=palette.array([colour]), widths=[2.0]
-    )
-    stream.log(path, style, static=True)
-
-
-def _lane(stream: rr.RecordingStream, lane: str, colours: dict[str, int]) -> None:
-    style = rr.StateConfiguration(values=list(colours), colors=palette.array(colours.values()))
-    stream.log(f"state/{lane}", style, static=True)
+def _top_hz(plant: Plant) -> float:
+    """Highest frequency of the spectrum: five times that of the absorber, or of the plant's only body, rounded."""
+    body = plant.absorber or plant.primary
+    wanted = 5.0 * np.sqrt(body.stiffness_n_m / body.mass_kg) / (2.0 * np.pi)
+    round_ones = np.array([1.0, 2.5, 5.0, 10.0]) * 10.0 ** np.floor(np.log10(wanted))
+    return float(round_ones[np.argmin(np.abs(np.log(round_ones / wanted)))])

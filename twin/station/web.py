@@ -17,7 +17,7 @@ import urllib.error
 import urllib.request
 import zipfile
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import rerun as rr
 import uvicorn
@@ -28,7 +28,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from twin.plant.errors import InputError, RunError
 from twin.rig.rerun_tool import rerun_environment, rerun_program
-from twin.station.live import free_port
+from twin.station.native import MEMORY_LIMIT, Broadcast, free_port
 
 MEDIA_TYPES = {
     "index.html": "text/html; charset=utf-8",
@@ -46,15 +46,21 @@ class WebViewer:
     Parameters
     ----------
     stream
-        Its sinks are replaced by a server for the viewer; feed it through a `LiveView` that keeps the stream.
+        Its sinks are replaced by a server for viewers; feed it through a `LiveView`.
     memory_limit
         How much of the run is kept for browsers that come late, such as ``100MB``.
+
+    Attributes
+    ----------
+    source
+        URL of the stream once it is served; ``rerun URL`` shows it in a window.
     """
 
-    def __init__(self, stream: rr.RecordingStream, *, memory_limit: str = "100MB") -> None:
+    def __init__(self, stream: rr.RecordingStream, *, memory_limit: str = MEMORY_LIMIT) -> None:
         self._stream = stream
         self._memory_limit = memory_limit
         self._files = tempfile.TemporaryDirectory(prefix="atmd-web-")
+        self.source = ""
         self._server: uvicorn.Server | None = None
         self._thread: threading.Thread | None = None
 
@@ -82,17 +88,9 @@ class WebViewer:
             listener.close()
             raise InputError(f"port {port} cannot be used ({error.strerror}); give another one") from error
         port = int(listener.getsockname()[1])
-        data_port = free_port()
         page = f"http://{_HOST}:{port}"
-        self._stream.set_sinks(
-            rr.GrpcServerSink(
-                bind_ip=_HOST,
-                port=data_port,
-                server_memory_limit=self._memory_limit,
-                cors_allow_origin=[page],
-            )
-        )
-        app = viewer_app(Path(self._files.name), data_port)
+        self.source = Broadcast(self._stream, self._memory_limit, [page]).url
+        app = viewer_app(Path(self._files.name), self.source)
         self._server = uvicorn.Server(
             uvicorn.Config(app, log_level="warning", lifespan="off", access_log=False)
         )
@@ -117,12 +115,12 @@ class WebViewer:
         self._files.cleanup()
 
 
-def viewer_app(files: Path, data_port: int) -> FastAPI:
-    """Application that serves the viewer's files; ``/`` opens it on the stream at that port of this machine."""
+def viewer_app(files: Path, source: str) -> FastAPI:
+    """Application that serves the viewer's files; ``/`` opens it on the stream at that URL."""
     app = FastAPI(title="atmd", docs_url=None, redoc_url=None, openapi_url=None)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
-    policy = security_policy((files / "index.html").read_text(encoding="utf-8"), data_port)
-    stream_url = quote(f"rerun+http://{_HOST}:{data_port}/proxy", safe="")
+    policy = security_policy((files / "index.html").read_text(encoding="utf-8"), urlsplit(source).port or 0)
+    stream_url = quote(source, safe="")
 
     @app.middleware("http")
     async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:

@@ -1,0 +1,1 @@
+"""What the views of a run are made of: drawing, stroboscope, spectrum, scales, styles."""
