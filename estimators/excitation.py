@@ -106,16 +106,16 @@ class ExcitationTracker:
             self._coast(n * dt)
             return None
         live, rows = found
-        values = block.values if live.all() else np.where(live, block.values, 0.0)
+        values = block.values if live is None else np.where(live, block.values, 0.0)
         band = (max(self._band[0], MIN_CYCLES / (n * dt)), min(self._band[1], 0.45 / dt))
-        samples = averaged(values, dt, self._expected_hz(band), None if rows.all() else rows)
+        samples = averaged(values, dt, self._expected_hz(band), rows)
         searched = self._course is None
         if self._course is None:
             strongest = self._search(samples, band)
             if strongest is None:
                 return None
             self._course, self._residual = _Course(strongest), None
-            samples = averaged(values, dt, strongest, None if rows.all() else rows)
+            samples = averaged(values, dt, strongest, rows)
         course = self._course
         half = 0.5 * n * dt
         course.go_on(half)
@@ -139,8 +139,8 @@ class ExcitationTracker:
         one_tone = self._looks_as_before(float(fit.residual_variance[self._column]))
         steady = course.correct(f_mid, f_std, one_tone) and not searched
         course.go_on(half)
-        dead = ~live
-        if dead.any():
+        if live is not None:
+            dead = ~live
             fit.amplitude[dead], fit.slope[dead], fit.harmonics[:, dead] = 0.0, 0.0, 0.0
             fit.harmonic_variance[:, dead] = math.inf
             variance[dead] = slope_variance[dead] = sample_variance[dead] = math.inf
@@ -163,17 +163,22 @@ class ExcitationTracker:
             duration_s=n * dt,
         )
 
-    def _usable(self, block: Block) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-        """Channels with enough samples, and rows where all of those are valid; None if that is not enough."""
+    def _usable(self, block: Block) -> tuple[NDArray[np.bool_] | None, NDArray[np.bool_] | None] | None:
+        """Channels with enough samples, and rows where all of those are valid; None for all.
+
+        None in place of both if that is not enough.
+        """
         if block.valid.all():
-            return np.ones(block.valid.shape[1], dtype=np.bool_), np.ones(block.n_samples, dtype=np.bool_)
+            return None, None
         least = max(8, math.ceil(MIN_VALID_SHARE * block.n_samples))
         count = np.count_nonzero(block.valid, axis=0)
         live = count >= least
         if not live[self._column]:
             return None
         rows = np.asarray(block.valid[:, live].all(axis=1))
-        return (live, rows) if np.count_nonzero(rows) >= least else None
+        if np.count_nonzero(rows) < least:
+            return None
+        return None if live.all() else live, None if rows.all() else rows
 
     def _converge(
         self, samples: Samples, course: "_Course", start_hz: float | None = None

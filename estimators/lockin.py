@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
+from estimators.small_matrices import invert_positive
 from twin.plant.compiled import kernel
-from twin.plant.linear import Array, ComplexArray
+from twin.plant.linear import Array, ComplexArray, read_only
 
 HARMONICS = (2, 3, 4, 5)
 
@@ -94,17 +94,22 @@ def averaged(
         (N,) rows to fit; None for all. Where some are missing nothing is averaged.
     """
     n = len(values)
-    time = np.asarray((np.arange(n) - 0.5 * (n - 1)) * step_s, dtype=np.float64)
     if used is not None:
-        return Samples(time, values, used, 1, step_s, n * step_s)
+        return Samples(_times(n, 1, step_s), values, used, 1, step_s, n * step_s)
     group = max(int(1.0 / (SAMPLES_PER_CYCLE * highest_hz * step_s)), 1)
     while n % group:
         group -= 1
     if group == 1:
-        return Samples(time, values, None, 1, step_s, n * step_s)
+        return Samples(_times(n, 1, step_s), values, None, 1, step_s, n * step_s)
     means = np.empty((n // group, values.shape[1]))
     group_means(values, means)
-    return Samples(time[::group] + 0.5 * (group - 1) * step_s, means, None, group, step_s, n * step_s)
+    return Samples(_times(n, group, step_s), means, None, group, step_s, n * step_s)
+
+
+@lru_cache(maxsize=8)
+def _times(n: int, group: int, step_s: float) -> Array:
+    """(n / group,) middles of groups of samples [s], from the middle of the block."""
+    return read_only((np.arange(0, n, group) - 0.5 * (n - 1)) * step_s + 0.5 * (group - 1) * step_s)
 
 
 def lock_in(samples: Samples, phase_mid: float, f_mid: float, rate: float) -> LockIn:
@@ -210,13 +215,9 @@ def _turning_by(steps: tuple[int, ...], turns: bytes) -> ComplexArray:
 
 def _inverse(gram: Array) -> Array:
     """Inverse of a Gram matrix; the pseudoinverse where its columns cannot be told apart."""
-    factor, failed = lapack.dpotrf(gram, lower=0)
-    if not failed:
-        upper, failed = lapack.dpotri(factor, lower=0)
-        if not failed:
-            rows, columns = np.triu_indices(len(gram), 1)
-            upper[columns, rows] = upper[rows, columns]
-            return np.asarray(upper)
+    inverse = gram.copy()
+    if invert_positive(inverse):
+        return inverse
     return np.asarray(np.linalg.pinv(gram))
 
 

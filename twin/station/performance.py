@@ -7,6 +7,7 @@ import numpy as np
 from estimators.types import Phasors, StateEstimate
 from tuning.types import Powers
 from twin.plant.blocks import Block
+from twin.plant.compiled import kernel
 from twin.plant.config import Plant, VoiceCoil
 from twin.plant.linear import Array
 from twin.station.frame import Performance
@@ -59,13 +60,13 @@ class PerformanceMeter:
         if coil is None or phasors is None:
             return None
         passive, limit = bounds_m
-        current = _current_of(coil, estimate)
+        powers, peak = _powers(coil, estimate, block)
         return Performance(
             displacement_m=self.displacement(phasors),
             passive_m=passive,
             limit_m=limit,
-            current_peak_a=float(np.max(np.abs(current))) if current is not None else math.nan,
-            powers=_powers(coil, current, estimate, block),
+            current_peak_a=peak,
+            powers=powers,
             budget_w=budget_w,
         )
 
@@ -107,24 +108,37 @@ class PerformanceMeter:
         return float(abs(1.0 - at_excitation / power))
 
 
-def _current_of(coil: VoiceCoil, estimate: StateEstimate) -> Array | None:
+def _powers(coil: VoiceCoil, estimate: StateEstimate, block: Block) -> tuple[Powers, float]:
+    """Powers over a block by the estimated states, v i = R i² + d/dt(L i²/2) + k i (v2 - v1); the peak current."""
     name = f"i_{coil.name}"
-    return estimate.mean[:, estimate.states.index(name)] if name in estimate.states else None
+    if coil.between is None or name not in estimate.states:
+        return Powers(math.nan, math.nan, math.nan), math.nan
+    first, second = (estimate.states.index(f"v_{body}") for body in coil.between)
+    mean = estimate.mean
+    at = estimate.states.index(name)
+    square, largest, through = current_sums(mean, at, first, second)
+    n = len(mean)
+    joule = coil.resistance_ohm * square / n
+    stored = 0.5 * coil.inductance_h * float(mean[-1, at] ** 2 - mean[0, at] ** 2)
+    electrical = joule + coil.force_constant_n_a * through / n + stored * block.sample_rate_hz / max(n - 1, 1)
+    return Powers(joule, coil.resistance_ohm * largest * largest, electrical), largest
 
 
-def _powers(coil: VoiceCoil, current: Array | None, estimate: StateEstimate, block: Block) -> Powers:
-    """Powers over a block from the estimated states: v i = R i² + d/dt(L i²/2) + k i (v2 - v1)."""
-    if current is None or coil.between is None:
-        return Powers(math.nan, math.nan, math.nan)
-    velocity = {b: estimate.mean[:, estimate.states.index(f"v_{b}")] for b in coil.between}
-    first, second = coil.between
-    joule = coil.resistance_ohm * current**2
-    stored = 0.5 * coil.inductance_h * (current[-1] ** 2 - current[0] ** 2)
-    mechanical = coil.force_constant_n_a * np.mean(current * (velocity[second] - velocity[first]))
-    return Powers(
-        joule_mean_w=float(np.mean(joule)),
-        joule_peak_w=float(np.max(joule)),
-        electrical_mean_w=float(
-            np.mean(joule) + mechanical + stored * block.sample_rate_hz / max(block.n_samples - 1, 1)
-        ),
-    )
+@kernel
+def current_sums(mean: Array, current: int, first: int, second: int) -> tuple[float, float, float]:
+    """Sum of the current's squares, its largest magnitude, and the sum of current times relative velocity.
+
+    Parameters
+    ----------
+    mean
+        (N, n) states.
+    current, first, second
+        Their columns.
+    """
+    squares, largest, through = np.zeros(4), 0.0, np.zeros(4)
+    for k in range(len(mean)):
+        i = mean[k, current]
+        squares[k % 4] += i * i
+        through[k % 4] += i * (mean[k, second] - mean[k, first])
+        largest = max(largest, abs(i))
+    return squares.sum(), largest, through.sum()

@@ -8,12 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.observer import Observer
 from estimators.types import StateEstimate
 from twin.plant.blocks import Block, Channel
+from twin.plant.compiled import kernel
 from twin.plant.config import Plant
 from twin.plant.inputs import InputSource
+from twin.plant.linear import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +76,16 @@ class PredictionScore:
         if any(block.first_sample < end and first < block.end_sample for first, end in self._fitted):
             return
         for row, sensor in enumerate(estimate.sensors):
-            y = block.values[:, self._columns[sensor]][block.valid[:, self._columns[sensor]]]
-            if len(y) == 0:
+            n, total, squares = column_sums(block.values, block.valid, self._columns[sensor])
+            if n == 0:
                 continue
             sums = self._sums.setdefault(sensor, [0.0] * 5)
-            sums[0] += len(y)
-            sums[1] += float(np.sum(y))
-            sums[2] += float(np.sum(y * y))
-            sums[3] += len(y) * float(estimate.prediction_rms[row]) ** 2
+            sums[0] += n
+            sums[1] += total
+            sums[2] += squares
+            sums[3] += n * float(estimate.prediction_rms[row]) ** 2
             if blind is not None and sensor in blind.sensors:
-                sums[4] += len(y) * float(blind.prediction_rms[blind.sensors.index(sensor)]) ** 2
+                sums[4] += n * float(blind.prediction_rms[blind.sensors.index(sensor)]) ** 2
 
     def scores(self) -> tuple[Score, ...]:
         """One score per sensor that was seen."""
@@ -94,3 +97,16 @@ class PredictionScore:
             without = math.sqrt(blind / n) / spread if self._blind is not None else None
             out.append(Score(sensor, math.sqrt(informed / n) / spread, without, int(n)))
         return tuple(out)
+
+
+@kernel
+def column_sums(values: Array, valid: NDArray[np.bool_], column: int) -> tuple[int, float, float]:
+    """How many valid samples a column has, their sum and the sum of their squares."""
+    count, total, squares = 0, np.zeros(4), np.zeros(4)
+    for k in range(len(values)):
+        if valid[k, column]:
+            y = values[k, column]
+            count += 1
+            total[k % 4] += y
+            squares[k % 4] += y * y
+    return count, total.sum(), squares.sum()

@@ -6,7 +6,7 @@ blocks at which answers came, all of which are recorded, so that a replay repeat
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,7 +195,7 @@ class Retuning:
         amplitude: float,
         moved_hz: float,
         curve: DampingCurve | None,
-        plant: Plant,
+        plant: Callable[[], Plant],
         learner: DampingLearner,
         reference_rms: float = 0.0,
         doubt: str = "",
@@ -209,7 +209,7 @@ class Retuning:
         moved_hz
             How far the excitation moved over this block [Hz].
         plant
-            The plant as identified.
+            Gives the plant as identified.
         reference_rms
             Root mean square of the coil's current reference over the block [A]; 0 if it is not recorded.
         doubt
@@ -219,7 +219,7 @@ class Retuning:
         self._block_s = block.n_samples / block.sample_rate_hz
         self._reference_rms.append(reference_rms)
         arrival = self.tuner.take(last)
-        done = Turn() if arrival is None else self._decide(block, arrival, plant, doubt)
+        done = Turn() if arrival is None else self._decide(block, arrival, plant(), doubt)
         self._since_question += 1
         asked = None
         if (
@@ -234,7 +234,7 @@ class Retuning:
             propose = (
                 not doubt and curve.status != "unestimated" and self._is_near(f, ahead) and self._is_wanted()
             )
-            self._open = self._question(last, plant, std, f, amplitude, ahead, propose=propose)
+            self._open = self._question(last, plant(), std, f, amplitude, ahead, propose=propose)
             self.tuner.ask(self._open)
             asked = self._next_question
             self._next_question += 1
@@ -324,19 +324,19 @@ class Retuning:
         decision = Decision(last, True, "automatic", "verified and better")
         return Turn(proposal=proposal, decision=decision, command=command, events=tuple(events))
 
-    def order(self, block: Block, order: Order | None, plant: Plant) -> Ordered | None:
+    def order(self, block: Block, order: Order | None, plant: Callable[[], Plant]) -> Ordered | None:
         """Take an order of the operator after a block, or the next step of the last one.
 
         Parameters
         ----------
         plant
-            The plant as identified.
+            Gives the plant as identified.
         """
         last = block.end_sample - 1
         if order is None:
             if not self._ramp or self._on_its_way is not None:
                 return None
-            further = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
+            further = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant())
             step = f"step {self._ramp_length - len(self._ramp)} of {self._ramp_length}"
             return Ordered(None, Decision(last, True, "operator", step), further)
         command: Command | None = None
@@ -351,16 +351,16 @@ class Retuning:
             case _ if self._on_its_way is not None or self._ramp:
                 words = "refused: another command is on its way; wait for the rig's answer"
             case "accept":
-                command, words = self._accept(block, order.number, plant)
+                command, words = self._accept(block, order.number, plant())
             case "schedule" if order.schedules:
                 self._ramp, self._ramp_length = list(order.schedules), len(order.schedules)
                 self.goal = order.goal or self.goal
-                command = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant)
+                command = self._command(block, ORDER_LEAD_BLOCKS, self._ramp.pop(0), plant())
                 words = "what-if accepted" + (f", step 1 of {self._ramp_length}" if self._ramp else "")
             case "revert" if self._before:
                 schedule, self.goal = self._before.pop()
                 self.approve = True
-                command = self._command(block, ORDER_LEAD_BLOCKS, schedule, plant)
+                command = self._command(block, ORDER_LEAD_BLOCKS, schedule, plant())
                 self._reverting = command.command_id
                 words = "back to the gains before"
             case _:

@@ -196,7 +196,7 @@ class Session:
         curve = self._learn(block, phasors, checked.findings, health, events)
         ordered = None
         if self.retuning is not None:
-            ordered = self.retuning.order(block, order, self.identified_plant())
+            ordered = self.retuning.order(block, order, self.identified_plant)
         turn = self._retune(block, phasors, moved, curve, health, force)
         events.extend(turn.events)
         performance = self._performance(block, phasors, estimate)
@@ -332,14 +332,15 @@ class Session:
         coil = self.plant.voice_coil
         rms = 0.0
         if coil is not None and coil.name in self._names:
-            rms = float(np.sqrt(np.mean(np.square(block.values[:, self._names.index(coil.name)]))))
+            signal = block.values[:, self._names.index(coil.name)]
+            rms = math.sqrt(float(signal @ signal) / max(len(signal), 1))
         return self.retuning.turn(
             block,
             phasors,
             amplitude,
             moved_hz,
             curve,
-            self.identified_plant(),
+            self.identified_plant,
             self.learner,
             reference_rms=rms if math.isfinite(rms) else 0.0,
             doubt=health.reason if health.verdict == "diverged" else "",
