@@ -88,6 +88,7 @@ def quantities(run: Replayed) -> tuple[Quantity, ...]:
             t["displacement_std_m"],
             True,
         ),
+        Quantity("motion_peak_m", "largest estimated motion", "m", t["motion_peak_m"], unknown, True),
         Quantity("stroke_peak_m", "stroke", "m", t["stroke_peak_m"], t["stroke_std_m"], True),
         Quantity("joule_mean_w", "mean Joule power", "W", t["joule_mean_w"], unknown, True),
         Quantity("joule_peak_w", "peak Joule power", "W", t["joule_peak_w"], unknown, True),

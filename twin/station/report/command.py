@@ -1,14 +1,20 @@
 """``atmd report`` on the command line."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from twin.plant.errors import InputError
+from twin.station.confirm import YesOption, accept_recording
 from twin.station.terminal import JsonOption, channel_options, must_be_writable, progress_bar, say
 from twin.station.terminal import report as write_result
+
+if TYPE_CHECKING:
+    from twin.station.opened import ReplayOptions
 
 PlantOption = Annotated[
     str | None,
@@ -51,6 +57,7 @@ def report(
     sample_rate: SampleRateOption = None,
     sidecar: SidecarOption = None,
     recompute: RecomputeOption = False,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Write the page to file after a test: what was run, how it went against the limits, what was proposed.
@@ -79,7 +86,7 @@ def report(
     must_be_a_page(html, [file])
     if plot is not None:
         must_be_a_plot(plot)
-    options = replay_options(plant, channel, sample_rate, sidecar, recompute=recompute)
+    options = replay_options(plant, channel, sample_rate, sidecar, recompute=recompute, yes=yes)
     with progress_bar("report") as progress:
         run = replayed(file, options, say, progress, name_of(file))
         said = document(run)
@@ -101,7 +108,7 @@ def report_table(said: dict[str, Any]) -> Table:
     whole = {True: "whole", False: "[red]not whole[/]", None: "no checksums"}[v["whole"]]
     table = Table(
         "figure", "limit", "worst seen", "when", "margin", "verdict",
-        title=f"{said['setup']['file']}: {said['setup']['plant']}, {said['setup']['seconds']:.1f} s, {whole}",
+        title=f"{escape(said['setup']['file'])}: {said['setup']['plant']}, {said['setup']['seconds']:.1f} s, {whole}",
         title_justify="left",
     )  # fmt: skip
     for e in said["limits"]:
@@ -125,11 +132,11 @@ def report_table(said: dict[str, Any]) -> Table:
             f"{h['worst_at_hz']:.1f} Hz",
         )
     else:
-        table.add_row("attenuation", "", "–", "", "", h["why_not"])
+        table.add_row("attenuation", "", "–", "", "", escape(h["why_not"]))
     table.add_row("model consistent", "", share(f["estimation"]["consistent_share"]), "", "", "of the run")
     table.add_row("masked values", "", str(v["masked"]["values"]), "", "", share(v["masked"]["share"]))
     for damage in v["damage"]:
-        table.add_row("[red]not whole[/]", "", "", "", "", damage)
+        table.add_row("[red]not whole[/]", "", "", "", "", escape(damage))
     return table
 
 
@@ -140,7 +147,8 @@ def replay_options(
     sidecar: Path | None,
     *,
     recompute: bool,
-) -> Any:
+    yes: bool,
+) -> "ReplayOptions":
     """Options of a replay, as the command line of `atmd replay` has them."""
     from twin.station.opened import ReplayOptions
 
@@ -150,6 +158,7 @@ def replay_options(
         sample_rate_hz=sample_rate,
         sidecar=sidecar,
         recompute=recompute,
+        accept=partial(accept_recording, yes=yes),
     )
 
 

@@ -1,6 +1,5 @@
 """``atmd compare`` on the command line."""
 
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +7,7 @@ from typing import Annotated
 import typer
 
 from twin.plant.errors import InputError
+from twin.station.confirm import YesOption
 from twin.station.report.command import (
     ChannelOption,
     HtmlOption,
@@ -53,6 +53,7 @@ def compare(
     sample_rate: SampleRateOption = None,
     sidecar: SidecarOption = None,
     recompute: RecomputeOption = False,
+    yes: YesOption = False,
     json_to: JsonOption = None,
 ) -> None:
     """Lay runs side by side: attenuation, power, damping, health, events, decisions, settings.
@@ -72,6 +73,7 @@ def compare(
     from twin.station.report.compared import as_data
     from twin.station.report.compared import compare as compare_runs
     from twin.station.report.figures import must_be_a_plot, save_plots
+    from twin.station.report.origin import is_own
     from twin.station.report.page import write_page
     from twin.station.report.replayed import replayed
 
@@ -82,13 +84,12 @@ def compare(
     if len(files) < 2:
         raise InputError("give two recordings or more; for a single one there is atmd report")
     files = _reference_first(files, reference)
-    options = replay_options(plant, channel, sample_rate, sidecar, recompute=recompute)
-    own = replay_options(None, None, None, None, recompute=recompute)
+    options = replay_options(plant, channel, sample_rate, sidecar, recompute=recompute, yes=yes)
+    own = replay_options(None, None, None, None, recompute=recompute, yes=False)
     runs = []
     for file, name in zip(files, _names(files), strict=True):
         with progress_bar(name) as progress:
-            carries = file.is_dir() or file.suffix.lower() == ".rrd"
-            runs.append(replayed(file, replace(own if carries else options), say, progress, name))
+            runs.append(replayed(file, own if plant and is_own(file) else options, say, progress, name))
     found = compare_runs(runs, by.value, step)
     said = as_data(found)
     with progress_bar("page"):

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 
 from twin.station.report.compare_plots import comparison_plots
@@ -17,6 +18,9 @@ SECTIONS = (
     ("figures", "Figures"), ("plots", "Plots"), ("runs", "Runs"), ("configuration", "Configuration"),
     ("gains", "Gains"), ("decisions", "Decisions"), ("events", "Events"), ("cells", "Numbers"),
 )  # fmt: skip
+MOST_SETTINGS = 40
+"""More of them are on the page alone."""
+
 LEVELS = {"error": "bad", "warning": "warn", "info": "open"}
 
 
@@ -257,7 +261,7 @@ def _cells(c: Comparison, said: dict[str, Any], names: list[str]) -> Html:
 
 def comparison_tables(c: Comparison, said: dict[str, Any]) -> Group:
     """Figures, differences and settings for the terminal."""
-    names = [run.name for run in c.runs]
+    names = [escape(run.name) for run in c.runs]
     first = Table("figure", title=f"Compared with {names[0]}", title_justify="left")
     first.add_column(names[0], justify="right")
     for name in names[1:]:
@@ -271,9 +275,11 @@ def comparison_tables(c: Comparison, said: dict[str, Any]) -> Group:
         title=f"Cell by cell, {c.grid[0]:g} to {c.grid[-1]:g} {unit}", title_justify="left",
     )  # fmt: skip
     for title, name, words in _difference_rows(c, said):
-        second.add_row(title, name, *words)
+        second.add_row(title, escape(name), *words)
     rows = said["configuration"]
     third = Table("setting", *names, title=f"{len(rows)} settings differ", title_justify="left")
-    for row in rows:
-        third.add_row(row["key"], *(shown(v) for v in row["values"]))
+    for row in rows[:MOST_SETTINGS]:
+        third.add_row(escape(row["key"]), *(escape(shown(v)) for v in row["values"]))
+    if len(rows) > MOST_SETTINGS:
+        third.add_row(f"and {len(rows) - MOST_SETTINGS} more: --html or --json", *[""] * len(names))
     return Group(first, second, third)

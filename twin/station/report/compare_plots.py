@@ -28,9 +28,10 @@ def comparison_plots(c: Comparison) -> list[Plot]:
     """Every plot for which there is something to show."""
     found = []
     where = "excitation frequency" if c.by == "frequency" else "time"
+    no_excitation = not any(line.quantity.key == "displacement_m" for line in c.lines)
     for line in c.lines:
         q = line.quantity
-        if q.key not in SHOWN:
+        if q.key not in SHOWN and not (q.key == "motion_peak_m" and no_excitation):
             continue
         caption = (
             f"Read at common cells of {where}, {c.step:g} {'Hz' if c.by == 'frequency' else 's'} wide; below: less "
@@ -48,7 +49,8 @@ def comparison_plots(c: Comparison) -> list[Plot]:
             "1 Ns/m. Doubt about the channels' delays counts in full, though two runs on one rig share it."
         )
         found.append(Plot("damping", "Coil damping c2(f)", caption, 4.4, lambda f: _damping(f, c)))
-    caption = "Each run's control, damping learner and model, from its own beginning. Marks: ▼ warning, ✖ error, ◆ command."
+    caption = "Each run's control, damping learner and model, from its own beginning. "
+    caption += "Marks: ▼ warning, ✖ error, ◆ command."
     found.append(
         Plot("timeline", "Course of events", caption, 0.9 + 0.8 * len(c.runs), lambda f: _timeline(f, c))
     )

@@ -34,7 +34,7 @@ def filed_page(run: Replayed, said: dict[str, Any]) -> str:
         tiles(_headline(said)),
         element("nav", links, aria_label="Sections"),
         section("Limits", "limits", _limits(said)),
-        section("Plots", "plots", plots),
+        section("Plots", "plots", plots, _prediction(said)),
         section("Set-up", "setup", _setup(said)),
         section("Proposals", "proposals", _proposals(said)),
         section("Predicted and achieved", "audit-table", _audit(said)),
@@ -122,6 +122,20 @@ def _limits(said: dict[str, Any]) -> Html:
     return join((table(heads, rows, (1, 2, 4, 6)), note))
 
 
+def _prediction(said: dict[str, Any]) -> Html:
+    rows = [
+        [s["sensor"], f"{s['nrmse']:.4f}", "–" if s["nrmse_without_input"] is None else f"{s['nrmse_without_input']:.4f}",
+         str(s["rows"])]
+        for s in said["figures"]["sensors"]
+    ]  # fmt: skip
+    if not rows:
+        return Html("")
+    words = "One-step prediction, rms(error)/std(signal), with the known input and without."
+    heads = ("sensor", "NRMSE", "without the input", "rows")
+    return join((element("h3", "Prediction", class_="sub"), element("p", words, class_="dim"),
+                 table(heads, rows, (1, 2, 3))))  # fmt: skip
+
+
 def _setup(said: dict[str, Any]) -> Html:
     s, v = said["setup"], said["verify"]
     whole = {
@@ -138,7 +152,7 @@ def _setup(said: dict[str, Any]) -> Html:
         ("File", files),
         (
             "Verified",
-            join((whole, f" {v['blocks']} blocks read" if v["blocks"] is not None else "", _masked(v))),
+            join((whole, f" {v['blocks']} blocks read;" if v["blocks"] is not None else "", _masked(v))),
         ),
         ("Plant", join((f"{s['plant']}, fingerprint ", element("code", s["plant_fingerprint"])))),
         ("Configuration", element("code", s["config_id"]) if s["config_id"] else "not recorded"),
@@ -160,7 +174,7 @@ def _setup(said: dict[str, Any]) -> Html:
 
 def _masked(v: dict[str, Any]) -> str:
     m = v["masked"]
-    text = f"; {m['values']} values masked"
+    text = f" {m['values']} values masked"
     return text + (f" ({share(m['share'])} of all)" if m["values"] else "")
 
 

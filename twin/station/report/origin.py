@@ -32,7 +32,7 @@ def origin(path: Path, opened: Opened) -> dict[str, Any]:
     InputError
         If a file can no longer be read.
     """
-    own = path.is_dir() or path.suffix.lower() == ".rrd"
+    own = is_own(path)
     config = _object(opened.config_json)
     facts: dict[str, Any] = {
         "own": own,
@@ -54,6 +54,19 @@ def origin(path: Path, opened: Opened) -> dict[str, Any]:
         "software": {},
         "config_id": None,
     }
+
+
+def is_own(path: Path) -> bool:
+    """Whether this program's recorder made a file, or may have: of other programs there are .rrd files, too."""
+    from twin.rig.recorded import open_recording
+
+    if not path.is_dir() and path.suffix.lower() != ".rrd":
+        return False
+    try:
+        open_recording(path)
+    except InputError:
+        return False
+    return True
 
 
 def _own(path: Path) -> dict[str, Any]:

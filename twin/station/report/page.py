@@ -79,8 +79,9 @@ def join(parts: Iterable[object]) -> Html:
 
 
 def element(name: str, *content: object, **attributes: str) -> Html:
-    """An element with its content escaped unless it is `Html`; ``class_`` is ``class``."""
-    with_values = "".join(f' {k.rstrip("_")}="{html.escape(v)}"' for k, v in attributes.items())
+    """An element with its content escaped unless it is `Html`; ``class_`` is ``class``, ``aria_label`` aria-label."""
+    names = ((k.rstrip("_").replace("_", "-"), v) for k, v in attributes.items())
+    with_values = "".join(f' {k}="{html.escape(v)}"' for k, v in names)
     return Html(f"<{name}{with_values}>{join(content)}</{name}>")
 
 
