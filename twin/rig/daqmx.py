@@ -1,7 +1,7 @@
 """A rig measured by an NI-DAQmx device, behind the same wire as any other: samples out, and no command obeyed.
 
 A computer between converter and coil would add milliseconds to a loop that stands some tens of microseconds
-(`docs/decisions/0013`): the controller stays where it is, and what its operator orders has to be done there.
+(`docs/daqmx.md`): the controller stays where it is, and what its operator orders has to be done there.
 Written to the documented interface of NI's Python package `nidaqmx`; no device stood behind its tests.
 """
 

@@ -559,7 +559,7 @@ def rig(
         device, measured = serve_device(options, daqmx)
         say(f"rig of plant '{plant}', measured as {daqmx} says; its controller takes no orders from here")
         say(f"samples on tcp://{bind}:{device.samples_port}, commands on tcp://{bind}:{device.commands_port}")
-        with closing(measured):
+        with closing(measured), _until_stopped():
             device.run()
         return
     programme = rig_programme(options)
