@@ -141,7 +141,8 @@ class RigServer:
             raise
         self._run_id = secrets.token_hex(8)
         self._station: bytes | None = None
-        self._heard_sample, self._heard_s = 0, 0.0
+        self._sent_sample = self._heard_sample = 0
+        self._heard_s = 0.0
         self._started = self._stopped = self._fallen_back = False
         self._station_sample = self._last_command = 0
         self._hello_due = 0.0
@@ -218,6 +219,7 @@ class RigServer:
                 commands_applied=tuple(a.command_id for a in acknowledgements if a.accepted),
                 notice=self.rig.tripped or ("station lost: control off" if self._fallen_back else ""),
             )
+            self._sent_sample = self.rig.next_sample
             samples = values.astype("<f4").tobytes()
             self._samples.send_multipart([TOPIC_SAMPLES, header.model_dump_json().encode(), samples])
             for acknowledgement in acknowledgements:
@@ -322,7 +324,7 @@ class RigServer:
                         told - 1
                     )  # it may have been listening, and have blocks to catch up with
                 if told > self._station_sample:  # one that repeats itself has stopped working
-                    self._station_sample, self._heard_sample = told, self.rig.next_sample
+                    self._station_sample, self._heard_sample = told, self._sent_sample
                     self._heard_s = time.monotonic()
             case "command":
                 self._command(sender, message.get("command"))
@@ -359,7 +361,7 @@ class RigServer:
     def _give_controls(self, sender: bytes) -> None:
         """Whoever speaks first has the controls, until leaving or falling silent; what was before it is not its own."""
         self._station, self._last_command = sender, 0
-        self._station_sample = self._heard_sample = self.rig.next_sample
+        self._station_sample, self._heard_sample = self.rig.next_sample, self._sent_sample
         self._heard_s = time.monotonic()
         self._answer(sender, {"type": "controls"})
         self._say("a station has the controls")
