@@ -1,5 +1,6 @@
 """What-if: curves that obey their changes, branches that come true within what they say of themselves."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -18,8 +19,10 @@ from twin.rig.simulated import SimulatedRig
 from twin.rig.tests_of_chapter_7 import programme
 from twin.station.demo import demo_programme, facts_of, session_for
 from twin.station.frame import Frame
+from twin.station.given_gains import split_given
 from twin.station.instant import instant_at
 from twin.station.whatif import WhatIfOptions, coil_of, run_whatif
+from twin.station.whatif_source import from_recording
 
 TEST_1, TEST_3 = programme("test1"), programme("test3")
 FACTS = facts_of(TEST_3)
@@ -262,8 +265,6 @@ def test_branch_settles_to_the_curves_steady_state(running) -> None:  # type: ig
 
 
 def test_branch_without_excitation_is_refused(running) -> None:  # type: ignore[no-untyped-def]
-    import dataclasses
-
     twin, frames, _ = running
     silent = dataclasses.replace(frames[-1], phasors=None)
     with pytest.raises(InputError, match="no excitation is tracked"):
@@ -300,12 +301,50 @@ def test_command_answers_for_a_plant_and_for_an_instant_of_a_recording(tmp_path:
         (WhatIfOptions(plant="rig", band="50,49"), "must rise"),
         (WhatIfOptions(file=Path("no.npz")), "needs a recording of this program"),
         (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 3.9 s"),
-        (WhatIfOptions(file=TEST_3_RECORDING, at_s=2.0, settings=("resistance_ohm=3",)), "another coil"),
+        (WhatIfOptions(plant="rig", settings=("gamma_n_m=x",)), "no number in N/m"),
+        (WhatIfOptions(plant="rig", settings=("beta_ns_m=-7@0",)), "above 0 Hz"),
+        (WhatIfOptions(plant="rig", settings=("beta_ns_m=-7@48", "beta_ns_m=-8@48")), "given twice"),
+        (WhatIfOptions(plant="rig", settings=("alpha_kg=0", "on_to_hz=70")), "add points or narrow the band"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_with_the_remedy(options: WhatIfOptions, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         run_whatif(options, lambda _: None)
+
+
+def test_gains_of_ones_own_are_laid_beside_those_in_use() -> None:
+    """What the rig has already, given by hand, is what the rig has; a point of its own changes that point."""
+    known = from_recording(TEST_3_RECORDING, 2.5)
+    used = known.schedule.at(known.schedule.frequency_hz[3])
+    here = known.schedule.frequency_hz[3]
+    same = tuple(f"{key}={getattr(used, key)}@{here}" for key in ("alpha_kg", "beta_ns_m", "gamma_n_m"))
+    options = WhatIfOptions(file=TEST_3_RECORDING, at_s=2.5, band=f"{here:g}", settings=same, branch_s=0.5)
+    result = run_whatif(options, lambda _: None)
+    (point,), branches = result["points"], {b["name"]: b for b in result["branches"]}
+    assert point["given"] == point["in_use"]
+    assert branches["given"]["displacement_m"] == branches["in use"]["displacement_m"]
+    given, others = split_given(["gamma_n_m=-3000@48.3", "low_pass_hz=500", "beta_ns_m=-9"])
+    assert given is not None
+    assert others == ("low_pass_hz=500",)
+    table = given.schedule(known.schedule, parse_changes(others))
+    assert table.at(48.3).gamma_n_m == -3000.0
+    assert table.at(here) == dataclasses.replace(used, beta_ns_m=-9.0, low_pass_hz=500.0)
+
+
+def test_a_branch_goes_on_with_other_parameters_from_the_same_start() -> None:
+    """At first nothing differs but what the force does; a heavier absorber then answers more slowly."""
+    traces = {}
+    for settings in ((), ("absorber_mass_kg=0.5",), ("resistance_ohm=3.5",), ("excitation=8",)):
+        options = WhatIfOptions(file=TEST_3_RECORDING, at_s=2.5, band="50", settings=settings, branch_s=0.5)
+        found = run_whatif(options, lambda _: None)["branches"]
+        traces[settings] = {b["name"]: np.array(b["displacement_m"]) for b in found}
+    plain = traces[()]["in use"]
+    size = float(np.abs(traces[()]["passive"]).max())
+    for settings, changed in traces.items():
+        assert abs(changed["in use"][0] - plain[0]) < 0.1 * size
+        assert settings == () or np.abs(changed["in use"] - plain).max() > 1e-9
+    ratio = np.std(traces[("excitation=8",)]["passive"][-200:]) / np.std(traces[()]["passive"][-200:])
+    assert 1.5 < ratio < 2.5
 
 
 def test_command_ends_with_2_for_a_key_that_does_not_exist(tmp_path: Path) -> None:

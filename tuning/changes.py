@@ -24,6 +24,8 @@ KEYS: dict[str, tuple[str, str]] = {
     "excitation": ("V, N or A", "peak of the excitation"),
     "damping_ns_m": ("Ns/m", "damping of the absorber at every frequency, in place of what is known"),
     "damping_scale": ("", "factor on the absorber's damping"),
+    "absorber_mass_kg": ("kg", "moving mass of the absorber"),
+    "absorber_stiffness_n_m": ("N/m", "of the absorber's spring"),
     "resistance_ohm": ("ohm", "of the coil"),
     "inductance_h": ("H", "of the coil"),
     "force_constant_n_a": ("N/A", "of the coil"),
@@ -47,6 +49,8 @@ class Changes:
     excitation: float | None = None
     damping_ns_m: float | None = None
     damping_scale: float | None = None
+    absorber_mass_kg: float | None = None
+    absorber_stiffness_n_m: float | None = None
     resistance_ohm: float | None = None
     inductance_h: float | None = None
     force_constant_n_a: float | None = None
@@ -104,6 +108,11 @@ class Changes:
             plant = plant.with_damping(absorber.name, self.damping_ns_m)
         elif self.damping_scale is not None:
             plant = plant.with_damping(absorber.name, _scaled(absorber.damping_ns_m, self.damping_scale))
+        parts = {"mass_kg": self.absorber_mass_kg, "stiffness_n_m": self.absorber_stiffness_n_m}
+        parts = {name: value for name, value in parts.items() if value is not None}
+        if parts:
+            bodies = tuple(b.model_copy(update=parts) if b.name == absorber.name else b for b in plant.body)
+            plant = plant.model_copy(update={"body": bodies})
         names = ("resistance_ohm", "inductance_h", "force_constant_n_a")
         new = coil
         if self.coil is not None:

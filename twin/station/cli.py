@@ -721,7 +721,7 @@ def export(
 
 @app.command(
     epilog="Examples: atmd whatif --plant rig --set budget_w=1 --set low_pass_hz=800   ·   "
-    "atmd whatif runs/demo.rrd --at 35 --set modulus_margin=0.3 --plot whatif.png"
+    "atmd whatif runs/demo.rrd --at 35 --set gamma_n_m=-3000@48 --plot whatif.png"
 )
 def whatif(
     file: Annotated[
@@ -758,12 +758,14 @@ def whatif(
 
     Keys of --set: budget_w, budget_kind, power_price_um_w (spend a watt only where it buys so many µm),
     modulus_margin, low_pass_hz, high_pass_hz, excitation (peak), damping_ns_m or damping_scale (of the absorber),
-    resistance_ohm, inductance_h, force_constant_n_a, coil (a preset's or plant file's), on_from_hz, on_to_hz. With --at
-    the whole twin is run on from that instant under each candidate: control off, gains in use, gains proposed; its
-    standard deviation covers the estimate, unknown forces and the damping. JSON keys: points (frequency_hz,
-    damping_ns_m, passive_displacement_m, limit_displacement_m, in_use and proposed with displacement_m, powers,
-    margins, gains), branches (name, displacement_m, displacement_std_m, current_a, off_measured_rms_m), budget_w,
-    budget_kind, excitation.
+    absorber_mass_kg, absorber_stiffness_n_m, resistance_ohm, inductance_h, force_constant_n_a, coil (a preset's or
+    plant file's), on_from_hz, on_to_hz; and gains of your own beside those proposed: alpha_kg, beta_ns_m, gamma_n_m,
+    for all frequencies or, as KEY=VALUE@HZ, for one operating point. With --at the whole twin is run on from that
+    instant under each candidate: control off, gains in use, gains proposed, gains given; its standard deviation covers
+    the estimate, unknown forces and the damping. JSON keys: points (frequency_hz, damping_ns_m,
+    passive_displacement_m, limit_displacement_m, in_use, proposed and given with displacement_m, powers, margins,
+    gains), branches (name, displacement_m, displacement_std_m, current_a, off_measured_rms_m), budget_w, budget_kind,
+    excitation.
     """
     from twin.station.whatif import WhatIfOptions, run_whatif, whatif_table
 

@@ -1,7 +1,7 @@
 """``atmd whatif``: predicted curves for changed settings, and branches of the twin from an instant of a recording."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,15 @@ from rich.table import Table
 
 from tuning.branch import Brancher, BranchTrace
 from tuning.changes import Changes, parse_changes
-from tuning.whatif import Curves, Design, WhatIf
+from tuning.loop import RigModel, margin_grid
+from tuning.whatif import MARGIN_POINTS, Curves, Design, WhatIf, design_at
+from twin.control.schedule import GainSchedule
 from twin.plant.config import VoiceCoil
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
+from twin.plant.linear import natural_frequencies_hz
 from twin.station.analyse import parse_frequencies
+from twin.station.given_gains import split_given
 from twin.station.instant import instant_at
 from twin.station.terminal import number
 from twin.station.whatif_source import (
@@ -77,7 +81,8 @@ def run_whatif(options: WhatIfOptions, say: Callable[[str], None]) -> dict[str, 
     """
     if (options.file is None) == (options.plant is None):
         raise InputError("give either a FILE (a recording, .rrd) or --plant PRESET|FILE.toml")
-    changes = parse_changes(options.settings, coil_of)
+    given, others = split_given(options.settings)
+    changes = parse_changes(others, coil_of)
     try:
         band = parse_frequencies(options.band)
     except InputError as error:
@@ -95,7 +100,11 @@ def run_whatif(options: WhatIfOptions, say: Callable[[str], None]) -> dict[str, 
         known.plant, known.facts, known.schedule, known.goal, known.amplitude, known.damping_std_ns_m
     )
     curves = what_if.curves(band, changes)
-    traces = _branches(known, changes, curves, options.branch_s) if options.at_s is not None else ()
+    own = None if given is None else given.schedule(known.schedule, changes)
+    designs = [
+        None if own is None else _design_of_own(known, changes, own, p.frequency_hz) for p in curves.points
+    ]
+    traces = _branches(known, changes, curves, own, options.branch_s) if options.at_s is not None else ()
     for point in curves.points:
         if point.reason:
             say(f"nothing proposed: {point.reason}")
@@ -108,27 +117,36 @@ def run_whatif(options: WhatIfOptions, say: Callable[[str], None]) -> dict[str, 
         "budget_kind": curves.goal.budget_kind,
         "excitation": curves.amplitude,
         "damping_std_ns_m": known.damping_std_ns_m,
-        "points": _points(curves),
+        "points": _points(curves, designs),
         "branches": [_branch(t, measured) for t in traces],
         "plot": None,
     }
     if options.plot is not None:
         from twin.station.whatif_plot import draw_whatif
 
-        draw_whatif(curves, traces, measured, options.plot)
+        draw_whatif(curves, traces, measured, options.plot, designs)
         result["plot"] = str(options.plot)
         say(f"plot: {options.plot}")
     return result
 
 
-def _branches(known: Known, changes: Changes, curves: Curves, seconds: float) -> tuple[BranchTrace, ...]:
+def _design_of_own(known: Known, changes: Changes, own: GainSchedule, frequency_hz: float) -> Design:
+    """What the gains that were given would do, on the changed plant."""
     plant = changes.plant(known.plant)
-    if plant.voice_coil != known.plant.voice_coil or changes.excitation is not None:
-        raise InputError(
-            "a branch goes on from what was measured: another coil or excitation cannot begin at that instant; "
-            "leave --at out, or those settings"
-        )
+    grid = margin_grid(known.facts.sample_rate_hz, natural_frequencies_hz(plant), MARGIN_POINTS)
+    gains = own.at(frequency_hz) if own.acts_at(frequency_hz) else None
+    model = RigModel(plant, known.facts, frequency_hz)
+    return design_at(model, gains, frequency_hz, changes.amplitude or known.amplitude, grid)
+
+
+def _branches(
+    known: Known, changes: Changes, curves: Curves, own: GainSchedule | None, seconds: float
+) -> tuple[BranchTrace, ...]:
+    """The twin run on from the instant with the parameters changed: states and phases go on as they were."""
+    plant = changes.plant(known.plant)
     instant = instant_at(known.plant, known.facts, known.frames)
+    if changes.amplitude is not None:
+        instant = replace(instant, drive=instant.drive * (changes.amplitude / abs(instant.drive)))
     low = known.schedule.on_from_hz if changes.on_from_hz is None else changes.on_from_hz
     high = known.schedule.on_to_hz if changes.on_to_hz is None else changes.on_to_hz
     gains = [(p.frequency_hz, p.proposed.gains) for p in curves.points if p.proposed and p.proposed.gains]
@@ -138,10 +156,12 @@ def _branches(known: Known, changes: Changes, curves: Curves, seconds: float) ->
     traces.append(brancher.run("in use", known.schedule, seconds, TRACE_STEP))
     if proposed is not None:
         traces.append(brancher.run("proposed", proposed, seconds, TRACE_STEP))
+    if own is not None:
+        traces.append(brancher.run("given", own, seconds, TRACE_STEP))
     return tuple(traces)
 
 
-def _points(curves: Curves) -> list[dict[str, Any]]:
+def _points(curves: Curves, own: Sequence[Design | None]) -> list[dict[str, Any]]:
     return [
         {
             "frequency_hz": p.frequency_hz,
@@ -150,10 +170,11 @@ def _points(curves: Curves) -> list[dict[str, Any]]:
             "limit_displacement_m": p.limit_m,
             "in_use": _design(p.in_use),
             "proposed": None if p.proposed is None else _design(p.proposed),
+            "given": None if given is None else _design(given),
             "active_limits": [{"name": a.name, "price": a.price} for a in p.active_limits],
             "reason": p.reason,
         }
-        for p in curves.points
+        for p, given in zip(curves.points, own, strict=True)
     ]
 
 
@@ -198,13 +219,19 @@ def whatif_table(r: dict[str, Any]) -> Table:
     changes = ", ".join(r["changes"]) or "as it is"
     title = f"What if: {changes} ({r['source']})\nmotion in µm, c2 in Ns/m; power and margin are the proposed gains'"
     table = Table(title=title, title_justify="left")
-    columns = ("Hz", "c2", "passive", "in use", "proposed", "limit", "W", "margin", "")
+    own = any(p["given"] is not None for p in r["points"])
+    columns = ["Hz", "c2", "passive", "in use", "proposed", "limit", "W", "margin", ""]
+    if own:
+        columns[5:5] = ["given"]
     for name in columns:
         table.add_column(name, justify="left" if not name else "right")
     for p in r["points"]:
         used, new = p["in_use"], p["proposed"]
         remark = "in use: unstable" if not used["stable"] else ""
-        if new is None:
+        given = p["given"]
+        if given is not None and not given["stable"]:
+            remark = "given: unstable"
+        elif new is None:
             remark = "nothing proposed"
         elif not new["control_on"]:
             remark = "control off"
@@ -214,6 +241,7 @@ def whatif_table(r: dict[str, Any]) -> Table:
             _micro(p["passive_displacement_m"]),
             _micro(used["displacement_m"]),
             _micro(new and new["displacement_m"]),
+            *([_micro(given and given["displacement_m"])] if own else []),
             _micro(p["limit_displacement_m"]),
             number(new and new["joule_mean_w"]),
             number(new and new["modulus_margin"]),

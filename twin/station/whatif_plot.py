@@ -2,25 +2,43 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from tuning.branch import BranchTrace
-from tuning.whatif import Curves
+from tuning.whatif import Curves, Design
 from twin.plant.errors import InputError
 from twin.plant.linear import Array
 
-COLOURS = {"passive": "#78909c", "in use": "#ef6c00", "proposed": "#1565c0", "limit": "#c62828"}
-DASHES = {"passive": ":", "in use": "--", "proposed": "-", "limit": "-."}
+COLOURS = {
+    "passive": "#78909c", "in use": "#ef6c00", "proposed": "#1565c0", "given": "#2e7d32", "limit": "#c62828",
+}  # fmt: skip
+DASHES: dict[str, Any] = {
+    "passive": ":",
+    "in use": "--",
+    "proposed": "-",
+    "given": (0, (5, 1, 1, 1)),
+    "limit": "-.",
+}
 LEAST_M = 1e-8
 
 
 def draw_whatif(
-    curves: Curves, traces: Sequence[BranchTrace], measured: tuple[Array, Array], path: Path
+    curves: Curves,
+    traces: Sequence[BranchTrace],
+    measured: tuple[Array, Array],
+    path: Path,
+    given: Sequence[Design | None] = (),
 ) -> None:
     """Write the picture.
+
+    Parameters
+    ----------
+    given
+        One per point of the curves: what gains of the person's own would do; none without any.
 
     Raises
     ------
@@ -40,17 +58,23 @@ def draw_whatif(
         "proposed": [_or_nan(p.proposed.displacement_m if p.proposed else None) for p in curves.points],
         "limit": [_or_nan(p.limit_m) for p in curves.points],
     }
+    designs: dict[str, list[Design | None]] = {
+        "in use": [p.in_use for p in curves.points],
+        "proposed": [p.proposed for p in curves.points],
+    }
+    if any(d is not None for d in given):
+        designs["given"] = list(given)
+        lines["given"] = [_or_nan(d.displacement_m if d else None) for d in given]
     for name, values in lines.items():
         shown = np.maximum(np.array(values, dtype=float), LEAST_M) * 1e6
-        motion.semilogy(f, shown, DASHES[name], color=COLOURS[name], label=name)
+        motion.semilogy(f, shown, linestyle=DASHES[name], color=COLOURS[name], label=name)
     motion.set(title="motion of the primary", xlabel="excitation [Hz]", ylabel="|x1| [µm]")
     motion.legend()
-    for name in ("in use", "proposed"):
-        designs = [p.in_use if name == "in use" else p.proposed for p in curves.points]
-        watts = [d.powers.joule_mean_w if d is not None and d.powers is not None else nan for d in designs]
-        power.plot(f, watts, DASHES[name], color=COLOURS[name], label=name)
-        reached = [_or_nan(d.modulus_margin if d else None) for d in designs]
-        margin.plot(f, reached, DASHES[name], color=COLOURS[name], label=name)
+    for name, found in designs.items():
+        watts = [d.powers.joule_mean_w if d is not None and d.powers is not None else nan for d in found]
+        power.plot(f, watts, linestyle=DASHES[name], color=COLOURS[name], label=name)
+        reached = [_or_nan(d.modulus_margin if d else None) for d in found]
+        margin.plot(f, reached, linestyle=DASHES[name], color=COLOURS[name], label=name)
     power.axhline(curves.goal.joule_mean_w, color=COLOURS["limit"], linestyle="-.", label="budget")
     power.set(title="mean Joule power", xlabel="excitation [Hz]", ylabel="R i_rms² [W]")
     margin.axhline(curves.goal.modulus_margin, color=COLOURS["limit"], linestyle="-.", label="wanted")
@@ -63,7 +87,12 @@ def draw_whatif(
         for trace in traces:
             x, std = 1e6 * trace.displacement_m, 1e6 * trace.displacement_std_m
             branch.plot(
-                trace.time_s, x, DASHES[trace.name], color=COLOURS[trace.name], label=trace.name, lw=1.0
+                trace.time_s,
+                x,
+                linestyle=DASHES[trace.name],
+                color=COLOURS[trace.name],
+                label=trace.name,
+                lw=1.0,
             )
             branch.fill_between(trace.time_s, x - std, x + std, color=COLOURS[trace.name], alpha=0.15)
         if len(measured[0]):
