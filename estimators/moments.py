@@ -16,6 +16,7 @@ from math import comb, pi
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
 
 from twin.plant.linear import Array, ComplexArray, read_only
 
@@ -84,10 +85,19 @@ def moments(values: Array, duration_s: float, frequency_hz: float, derivatives: 
 
 def _leibniz(frequency_hz: Array, derivatives: int) -> ComplexArray:
     """(n, d + 1, d + 1): derivatives of ``w exp(-j 2 pi f t)`` out of those of w."""
+    binomial, power = _binomial(derivatives)
+    powers = [np.ones(len(frequency_hz), dtype=np.complex128)]
+    for _ in range(derivatives):
+        powers.append(powers[-1] * (-2j * pi * frequency_hz))
+    return np.asarray(binomial * np.array(powers).T[:, power])
+
+
+@lru_cache(maxsize=MOST_DERIVATIVES + 1)
+def _binomial(derivatives: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(d + 1, d + 1) coefficients of Leibniz's rule, and how often its factors are the turning's derivatives."""
     order = np.arange(derivatives + 1)
     binomial = np.array([[comb(m, i) for i in order] for m in order])
-    power = np.maximum(order[:, None] - order[None, :], 0)
-    return np.asarray(binomial * (-2j * pi * frequency_hz[:, None, None]) ** power)
+    return binomial, np.maximum(order[:, None] - order[None, :], 0)
 
 
 def _steps(cycles: float) -> tuple[int, ...]:

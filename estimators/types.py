@@ -1,5 +1,6 @@
 """What the estimators hand on: estimates that carry their own uncertainty."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -130,6 +131,15 @@ class Phasors:
         std = np.full(len(size), UNKNOWN_ANGLE_STD_RAD)
         std[known] = np.minimum(ratio, UNKNOWN_ANGLE_STD_RAD)
         return std
+
+    def distortion_of(self, channel: str) -> float:
+        """Total harmonic distortion of one channel, as `distortion` has it for all."""
+        column = self.channels.index(channel)
+        size, noise = abs(complex(self.amplitude[column])), sum(self.harmonic_variance[:, column].tolist())
+        if not (math.isfinite(noise) and size > 0.0):
+            return 0.0
+        power = sum(abs(h) ** 2 for h in self.harmonics[:, column].tolist())
+        return math.sqrt(max(power - noise, 0.0)) / size
 
     def distortion(self) -> tuple[Array, Array]:
         """Total harmonic distortion: r.m.s. of the fitted harmonics over the fundamental, noise taken off.

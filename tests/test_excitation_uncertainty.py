@@ -148,6 +148,7 @@ def test_harmonics_are_told_with_their_phase_and_what_they_are_worth() -> None:
         error = np.abs(np.abs(turned) - np.abs(list(parts.values())))
         inside.append(error[[0, 1, 3]] < 1.96 * std[[0, 1, 3]])
         thd, thd_std = p.distortion()
+        assert p.distortion_of(p.channels[0]) == pytest.approx(float(thd[0]), rel=1e-12)
         distortion.append((thd[0] - truth) / thd_std[0])
         frequency.append((p.frequency_hz - 48.7) / p.frequency_std_hz)
         assert np.all(np.isfinite(thd))

@@ -63,8 +63,7 @@ class RunLog:
         self.curve = frame.curve or self.curve
         self.consistent += frame.health is not None and frame.health.verdict == "consistent"
         if frame.phasors is not None:
-            thd, _ = frame.phasors.distortion()
-            self.distortion.append(float(thd[frame.phasors.channels.index(frame.phasors.reference)]))
+            self.distortion.append(frame.phasors.distortion_of(frame.phasors.reference))
         self.force_n = frame.force_n or self.force_n
         self._on_for_s = self._on_for_s + block.n_samples / block.sample_rate_hz if block.control_on else 0.0
         self.nis.append(frame.estimate.nis)
