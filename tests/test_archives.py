@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import pyuff
+import rerun as rr
 import scipy.io
 import scipy.io.wavfile
 from nptdms import ChannelObject, TdmsWriter
@@ -142,6 +143,74 @@ def _uff(folder: Path) -> Path:
     return path
 
 
+def _uff_text(folder: Path) -> Path:
+    path = _uff(folder)
+    sets = pyuff.UFF(str(path)).read_sets()
+    path.unlink()
+    for dataset in sets:
+        with warnings.catch_warnings(action="ignore"):
+            pyuff.UFF(str(path)).write_sets(dataset | {"binary": 0}, "add")
+    return path
+
+
+def _mat7(folder: Path) -> Path:
+    path = _mat5(folder)
+    scipy.io.savemat(path, {"time": T, "acceleration": ACCELERATION, "push": PUSH}, do_compression=True)
+    return path
+
+
+def _hdf5(folder: Path) -> Path:
+    path = folder / "run.h5"
+    with h5py.File(path, "w") as file:
+        for name, values, unit in (
+            ("time", T, "s"),
+            ("acceleration", ACCELERATION, "g"),
+            ("push", PUSH, "V"),
+        ):
+            file.create_dataset(name, data=values, chunks=(300,), compression="gzip", shuffle=True)
+            file[name].attrs["unit"] = unit
+    return path
+
+
+def _rrd(folder: Path) -> Path:
+    path = folder / "run.rrd"
+    stream = rr.RecordingStream("somebody_else")
+    stream.save(path)
+    for part in (slice(600, N), slice(0, 600)):  # not in order
+        stamps = [rr.TimeColumn("time", duration=T[part])]
+        for name, values in (("acceleration", ACCELERATION), ("push", PUSH)):
+            stream.send_columns(name, stamps, rr.Scalars.columns(scalars=values[part]))
+    stream.log("remark", rr.TextLog("not a series"))
+    stream.flush()
+    stream.disconnect()
+    (folder / "run.json").write_text('{"channels": {"acceleration": "g measured"}}')
+    return path
+
+
+def _wav_of_integers(folder: Path) -> Path:
+    path = folder / "run.wav"
+    full = np.column_stack([ACCELERATION / 2.0, PUSH / 10.0]) * 2.0**31
+    three = full.astype(">i4").view(np.uint8).reshape(-1, 4)[:, :3]  # 24 bits, of which there is no such type
+    data = three[:, ::-1].tobytes()
+    layout = struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 2, int(FS), int(FS) * 6, 6, 24)
+    chunks = (
+        b"WAVE"
+        + layout
+        + b"LIST"
+        + struct.pack("<I", 3)
+        + b"odd\0"
+        + b"data"
+        + struct.pack("<I", len(data))
+        + data
+    )
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(chunks)) + chunks)
+    (folder / "run.toml").write_text(
+        '[channels]\nacceleration = { array = "channel1", unit = "g", scale = 2.0 }\n'
+        'push = { array = "channel2", unit = "V", scale = 10.0 }\n'
+    )
+    return path
+
+
 def _wav(folder: Path) -> Path:
     path = folder / "run.wav"
     scipy.io.wavfile.write(path, int(FS), np.column_stack([ACCELERATION, PUSH]).astype(np.float32))
@@ -151,7 +220,8 @@ def _wav(folder: Path) -> Path:
 
 FORMATS: dict[str, Write] = {
     "npz": _npz, "mat v5": _mat5, "mat v7.3": _mat73, "csv": _csv, "text": _german, "parquet": _parquet,
-    "tdms": _tdms, "uff": _uff, "wav": _wav,
+    "tdms": _tdms, "uff": _uff, "uff as text": _uff_text, "wav": _wav, "wav 24 bit": _wav_of_integers, "mat v7": _mat7,
+    "hdf5": _hdf5, "rrd": _rrd,
 }  # fmt: skip
 
 
@@ -172,7 +242,7 @@ def test_what_was_written_comes_back_in_si_units(written: Path) -> None:
     assert [b.first_sample for b in blocks] == list(range(0, N, 20))
     assert all(b.valid.all() for b in blocks)
     expected = np.column_stack([ACCELERATION * 9.80665, PUSH])
-    np.testing.assert_allclose(joined(blocks), expected, atol=2e-6)
+    np.testing.assert_allclose(joined(blocks), expected, atol=3e-6)
     np.testing.assert_array_equal(recording.values, joined(blocks))
     np.testing.assert_array_equal(joined(list(recording.blocks())), joined(blocks))  # a second time
     assert all("g -> m/s²" in str(m) or "V -> V" in str(m) for m in recording.mapping)

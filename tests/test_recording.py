@@ -187,7 +187,7 @@ WRITER = """
 import os, random, signal, struct, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_recording import a_block, a_recorder
+from test_recording import Storage, a_block, a_recorder
 folder, kills = Path(sys.argv[1]), int(sys.argv[3])
 moments = random.Random(20260)
 for k in range(kills):  # imports are done: each writer is a fork of this process, which itself writes nothing
@@ -196,18 +196,20 @@ for k in range(kills):  # imports are done: each writer is a fork of this proces
     child = os.fork()
     if child == 0:
         os.close(told)
-        recorder = a_recorder(folder / f"{k}.rrd")
+        limits = Storage(rotate_bytes=60_000, keep_free_bytes=0) if k % 3 == 0 else None  # also between two files
+        recorder = a_recorder(folder / f"{k}.rrd", storage=limits)
         i = 0
         while True:
             recorder.write_block(a_block(i * n, n))
             i += 1
             os.write(tell, struct.pack("<I", i))
     os.close(tell)
+    words = os.read(told, 4) if moments.random() < 0.8 else b""  # some are killed before their first block
     time.sleep(moments.uniform(0.0, 0.12))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     with os.fdopen(told, "rb") as pipe:
-        words = pipe.read()
+        words += pipe.read()
     taken = struct.unpack("<I", words[-4:])[0] if words else 0
     print(k, n, taken, flush=True)
 """
@@ -230,7 +232,7 @@ def test_whenever_a_recorder_is_killed_all_but_the_block_in_its_hands_comes_back
         began += 1
         recording = open_recording(path, hold_bytes=HELD_BYTES)
         read = list(recording.blocks())
-        assert not recording.finished
+        assert not recording.finished or len(recording.parts) > 1  # killed between two files
         assert taken - 1 <= len(read) <= taken + 1, (
             k,
             n,
@@ -382,7 +384,7 @@ def test_sizes_and_times_are_read_as_people_write_them() -> None:
         storage("1GB", "1GB")
 
 
-@pytest.mark.parametrize("part", [0.35, 0.8, 0.999])
+@pytest.mark.parametrize("part", [0.37, 0.8, 0.999])
 def test_a_file_cut_short_is_read_up_to_its_last_whole_block(tmp_path: Path, part: float) -> None:
     path = tmp_path / "run.rrd"
     written = a_run(path)

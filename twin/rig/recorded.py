@@ -1,11 +1,6 @@
 """Reading a recorded run back, bit for bit, whole or damaged."""
 
 import json
-import shutil
-import subprocess
-import tempfile
-import warnings
-import weakref
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -16,8 +11,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from pydantic import ValidationError
-from rerun.chunk import LazyChunkStream, RrdReader
-from rerun.error_utils import RerunWarning
 
 from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel
@@ -25,13 +18,15 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.recording import ACKNOWLEDGEMENTS, COMMANDS, FORMAT_VERSION, PROPERTY, ROOT
 from twin.rig.regroup import Mark
-from twin.rig.rerun_tool import rerun_environment, rerun_program
-from twin.rig.rrf import copy_whole_part, extent
+from twin.rig.rrf import extent, rows
 from twin.rig.storage import part_of, parts_beside
 
-_REPAIR_TIMEOUT_S = 600.0
 HELD_BYTES = 256_000_000
 """Raw blocks up to so much stay in memory once read, if asked: a minute at 50 kS/s is read once and not twice."""
+
+
+class NotOursError(InputError):
+    """A Rerun file of another program."""
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
@@ -55,7 +50,9 @@ class Recording:
     end_sample
         Index of the first sample after the last block.
     repaired
-        A file was cut short; what follows its last whole row is lost.
+        A file was cut short, what follows its last whole row is lost; or `damaged_rows` are.
+    damaged_rows
+        So many pieces of the file, blocks or others, are damaged and left out.
     finished
         The recorder closed its last file; else it was killed, or is still at it.
     """
@@ -75,9 +72,9 @@ class Recording:
     n_blocks: int
     end_sample: int
     repaired: bool
+    damaged_rows: int
     finished: bool
     _run_id: str
-    _sources: tuple[Path, ...]
     _in_order: bool
     _notes: dict[str, list[tuple[int, str]]] = field(repr=False)
     _marks: tuple[Mark, ...] = field(repr=False)
@@ -85,8 +82,8 @@ class Recording:
 
     @property
     def source(self) -> Path:
-        """The first file that is read: the given one, or the whole part of it where that was cut short."""
-        return self._sources[0]
+        """The first file that is read."""
+        return self.parts[0]
 
     @property
     def marks(self) -> tuple[Mark, ...]:
@@ -137,9 +134,10 @@ class Recording:
         if self._held is not None:
             yield from self._held
             return
-        for source in self._sources:
-            for chunk in _stream(source).filter(content=f"/{ROOT}/raw"):
-                yield chunk.to_record_batch()
+        for part in self.parts:
+            for found in rows(part):
+                if found.batch is not None and found.entity == f"/{ROOT}/raw":
+                    yield found.batch
 
     def _block(self, first_sample: int, row: dict[str, Any]) -> Block:
         if zlib.crc32(row["invalid"], zlib.crc32(row["samples"])) != row["crc32"]:
@@ -194,11 +192,15 @@ def open_recording(path: Path, *, hold_bytes: int = 0, alone: bool = False) -> R
     beside = {} if alone else parts_beside(path)
     if min(beside, default=number) != number:
         return first
-    found, numbers = [first], [number]
+    found, numbers, begun_only = [first], [number], False
     for k, other in sorted(beside.items()):
         if k <= number:
             continue
-        part = _open_file(other, hold_bytes - sum(_held_bytes(p) for p in found))
+        try:
+            part = _open_file(other, hold_bytes - sum(_held_bytes(p) for p in found))
+        except InputError:
+            begun_only = k == max(beside)  # killed before its first row, or nothing of it is left
+            continue
         if part._run_id != first._run_id:
             continue  # another run's, left beside this one
         found.append(part)
@@ -206,7 +208,8 @@ def open_recording(path: Path, *, hold_bytes: int = 0, alone: bool = False) -> R
     missing = (
         tuple(k for k in range(1, numbers[-1]) if k not in numbers) if len(found) > 1 or number > 1 else ()
     )
-    return _joined(found, missing)
+    whole = _joined(found, missing)
+    return replace(whole, finished=False) if begun_only else whole
 
 
 def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
@@ -216,11 +219,11 @@ def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
         return replace(first, missing_parts=missing) if missing else first
     notes: dict[str, list[tuple[int, str]]] = {}
     for part in parts:
-        for kind, rows in part._notes.items():
-            notes.setdefault(kind, []).extend(rows)
+        for kind, lines in part._notes.items():
+            notes.setdefault(kind, []).extend(lines)
     marks = sorted((mark for part in parts for mark in part.marks), key=_first_sample)
     held = [part._held for part in parts]
-    whole = replace(
+    return replace(
         first,
         parts=tuple(p for part in parts for p in part.parts),
         missing_parts=missing,
@@ -228,17 +231,14 @@ def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
         n_blocks=sum(part.n_blocks for part in parts),
         end_sample=max(part.end_sample for part in parts),
         repaired=any(part.repaired for part in parts),
+        damaged_rows=sum(part.damaged_rows for part in parts),
         finished=parts[-1].finished,
-        _sources=tuple(s for part in parts for s in part._sources),
         _in_order=all(part._in_order for part in parts)
         and all(a.end_sample <= b.marks[0].first_sample for a, b in pairwise(parts) if b.marks),
         _notes={kind: sorted(rows, key=lambda row: row[0]) for kind, rows in notes.items()},
         _marks=tuple(marks),
         _held=None if None in held else tuple(batch for some in held if some is not None for batch in some),
     )
-    # Repaired copies live as long as the recordings they were made for.
-    weakref.finalize(whole, list, parts)
-    return whole
 
 
 def _only_run(folder: Path) -> Path:
@@ -267,80 +267,36 @@ def _open_file(path: Path, hold_bytes: int) -> Recording:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if magic != b"RRF2":
         raise InputError(f"{path}: is no Rerun recording (.rrd); give a file that 'atmd' recorded")
-    # Rerun's reader takes a file that ends inside a message's head for a whole one.
-    if not extent(path).cut:
-        try:
-            return _scan(path, path, hold_bytes)
-        except (RuntimeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-    folder = tempfile.mkdtemp(prefix="atmd-")
     try:
-        recording = _scan_damaged(path, Path(folder), hold_bytes)
-    except (RuntimeError, ValueError) as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, InputError):
-            raise
+        return _scan(path, hold_bytes)
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise InputError(
             f"{path}: is damaged and nothing in it can be recovered ({error}); use another copy"
         ) from error
-    # The repaired copy stays for as long as the recording is in use.
-    weakref.finalize(recording, shutil.rmtree, folder, ignore_errors=True)
-    return recording
 
 
-def _scan_damaged(path: Path, folder: Path, hold_bytes: int) -> Recording:
-    """Read what is whole of a file: up to where it was cut, or, with Rerun's own tool, around the damage."""
-    cut = folder / "whole.rrd"
-    if copy_whole_part(path, cut):
-        try:
-            return _scan(path, cut, hold_bytes)
-        except (RuntimeError, ValueError):
-            cut.unlink()  # it was not the end alone
-    return _scan(path, _repair(path, folder), hold_bytes)
-
-
-def _repair(path: Path, folder: Path) -> Path:
-    """Copy all whole chunks of a damaged file to a new one, with Rerun's own tool."""
-    whole = folder / "repaired.rrd"
-    command = [rerun_program(), "rrd", "filter", "--continue-on-error", str(path), "-o", str(whole)]
-    try:
-        subprocess.run(
-            command, env=rerun_environment(), capture_output=True, timeout=_REPAIR_TIMEOUT_S, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise InputError(
-            f"{path}: is cut short and could not be repaired ({error}); try: rerun rrd filter --continue-on-error"
-        ) from error
-    if not whole.is_file():
-        raise InputError(f"{path}: is cut short before its first whole row; nothing was recorded")
-    return whole
-
-
-def _stream(path: Path) -> LazyChunkStream:
-    with warnings.catch_warnings():
-        # A killed recorder leaves no index at the end; streaming does not need one.
-        warnings.simplefilter("ignore", RerunWarning)
-        return RrdReader(path).stream()
-
-
-def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
+def _scan(path: Path, hold_bytes: int) -> Recording:
     """One pass over the file: properties, notes, and where the blocks are."""
+    frame, damaged, any_rows = extent(path), 0, False
     properties: dict[str, str] = {}
     notes: dict[str, list[tuple[int, bytes, str]]] = {}
     marks: list[Mark] = []
     held: list[pa.RecordBatch] | None = [] if hold_bytes > 0 else None
-    for chunk in _stream(source):
-        entity = chunk.entity_path
+    for found in rows(path):
+        entity, batch = found.entity, found.batch
+        if batch is None:
+            damaged += 1
+            continue
+        any_rows = True
         if entity == f"/__properties/{PROPERTY}":
-            batch = chunk.to_record_batch()
             properties |= {
                 name: str(_first(batch.column(name)[batch.num_rows - 1].as_py()))
                 for name in batch.schema.names
                 if not name.startswith("rerun.")
             }
         elif entity == f"/{ROOT}/raw":
-            batch = chunk.to_record_batch()
             marks += _marks_in(batch)
             hold_bytes -= batch.nbytes
             if held is not None and hold_bytes >= 0:
@@ -348,14 +304,15 @@ def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
             else:
                 held = None
         elif entity.startswith(f"/{ROOT}/"):
-            batch = chunk.to_record_batch()
-            rows = zip(
+            lines = zip(
                 batch.column("sample").to_pylist(),
                 batch.column("rerun.controls.RowId").to_pylist(),
                 (_first(text) for text in batch.column("json").to_pylist()),
                 strict=True,
             )
-            notes.setdefault(entity.removeprefix(f"/{ROOT}/"), []).extend(rows)
+            notes.setdefault(entity.removeprefix(f"/{ROOT}/"), []).extend(lines)
+    if not any_rows:
+        raise InputError(f"{path}: is cut short before its first whole row; nothing was recorded")
     known = _parse(path, properties)
     return Recording(
         path=path,
@@ -365,13 +322,13 @@ def _scan(path: Path, source: Path, hold_bytes: int) -> Recording:
         n_samples=sum(mark.n_samples for mark in marks),
         n_blocks=len(marks),
         end_sample=max((mark.end_sample for mark in marks), default=0),
-        repaired=source != path,
-        finished=extent(path).finished,
+        repaired=frame.cut or damaged > 0,
+        damaged_rows=damaged,
+        finished=frame.finished,
         _run_id=properties.get("run_id", ""),
-        _sources=(source,),
         _in_order=all(a.first_sample <= b.first_sample for a, b in pairwise(marks)),
         # Row ids count up as rows are written: they keep the order of notes at the same sample.
-        _notes={kind: [(sample, text) for sample, _, text in sorted(rows)] for kind, rows in notes.items()},
+        _notes={kind: [(sample, text) for sample, _, text in sorted(lines)] for kind, lines in notes.items()},
         _marks=tuple(sorted(marks, key=_first_sample)),
         _held=None if held is None else tuple(held),
     )
@@ -393,7 +350,10 @@ def _first_sample(mark: Mark) -> int:
 
 def _parse(path: Path, properties: dict[str, str]) -> dict[str, Any]:
     if "format_version" not in properties:
-        raise InputError(f"{path}: is no recording of this program; give a file that 'atmd' recorded")
+        raise NotOursError(
+            f"{path}: is no recording of this program; give a file that 'atmd' recorded, or say with --plant whose "
+            "channels its scalars are"
+        )
     if int(properties["format_version"]) > FORMAT_VERSION:
         raise InputError(
             f"{path}: was recorded by the newer version {properties['program_version']}; update this program"

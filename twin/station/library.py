@@ -1,11 +1,10 @@
 """``atmd recordings``: what is recorded, whether it is whole, and how to get it out."""
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -13,6 +12,9 @@ from rich.table import Table
 from twin.plant.blocks import Block
 from twin.plant.errors import InputError
 from twin.station.terminal import JsonOption, must_be_writable, progress_bar, report, say
+
+if TYPE_CHECKING:
+    from twin.rig.recorded import Recording
 
 recordings_app = typer.Typer(
     name="recordings",
@@ -170,13 +172,14 @@ def repair(
 ) -> None:
     """Copy all that is whole of a recording that was cut short to a new file; the old one stays as it is."""
     from twin.rig.recorded import open_recording
+    from twin.rig.rrf import copy_sound_part
 
     if out.exists():
         raise InputError(f"{out}: is there already; choose another name or remove it first")
     if not out.absolute().parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.absolute().parent}; make it first")
     recording = open_recording(file)
-    shutil.copyfile(recording.source, out)
+    copy_sound_part(file, out)
     found = inspect(out)
     say(f"{out}: {found.good_blocks} blocks, {recording.end_sample / recording.sample_rate_hz:.1f} s")
     if not recording.repaired:
@@ -258,6 +261,8 @@ def inspect(file: Path) -> Inspection:
 
     recording = open_recording(file)
     damage = ["cut short: what follows its last whole row is lost"] if recording.repaired else []
+    if recording.damaged_rows:
+        damage = [f"{recording.damaged_rows} pieces of it are damaged and left out"]
     good = masked = 0
     following: int | None = None
     gaps = []
@@ -309,8 +314,16 @@ def _line(path: Path) -> dict[str, Any]:
         "plant": recording.plant.name,
         "seconds": recording.end_sample / recording.sample_rate_hz,
         "commands": len(recording.commands()),
-        "remark": "cut short; readable to its last whole block" if recording.repaired else "",
+        "remark": _remark(recording),
     }
+
+
+def _remark(recording: "Recording") -> str:
+    if recording.damaged_rows:
+        return f"damaged; {recording.damaged_rows} pieces are left out"
+    if recording.repaired:
+        return "cut short; readable to its last whole block"
+    return "" if recording.finished else "not finished: its recorder was killed, or is still at it"
 
 
 def _between(

@@ -14,7 +14,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.plant.files import load_plant
 from twin.rig.foreign import ForeignRecording, open_foreign
-from twin.rig.recorded import HELD_BYTES, Recording, open_recording
+from twin.rig.recorded import HELD_BYTES, NotOursError, Recording, open_recording
 from twin.rig.regroup import in_pieces, restored
 from twin.rig.storage import Storage
 from twin.station.answers import NOTHING_KNOWN, KnownAnswers, known_answers
@@ -131,7 +131,11 @@ def open_any(path: Path, options: ReplayOptions) -> Opened:
     if not path.exists():
         raise InputError(f"{path}: no such recording; check the path")
     if path.is_dir() or path.suffix.lower() == ".rrd":
-        return _open_own(path, options)
+        try:
+            return _open_own(path, options)
+        except NotOursError:
+            if options.plant is None:
+                raise
     return _open_foreign(path, options)
 
 
@@ -178,7 +182,11 @@ def _open_own(path: Path, options: ReplayOptions) -> Opened:
 def _condition(recording: Recording) -> list[str]:
     """What a person should know of the files."""
     remarks = []
-    if recording.repaired:
+    if recording.damaged_rows:
+        remarks.append(
+            f"{recording.damaged_rows} pieces of the file are damaged and left out: blocks or decisions are missing"
+        )
+    elif recording.repaired:
         remarks.append("the file was cut short; what follows its last whole block is lost")
     elif not recording.finished:
         remarks.append("its recorder did not finish it: it was killed, or is still recording")

@@ -12,8 +12,19 @@ from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 WHOLE_SHARE = 0.4
-"""An array that can only be read whole may take this share of the memory that is free."""
+"""What can only be read whole may take this share of the memory that is free."""
+
+WHOLE_BYTES = 64_000_000
+"""Up to this size an array is read at once also where it could be read in parts."""
+
+MOST_PACKED = 5000
+"""So many times its size in the file is the most a measured array may be; deflate reaches 1032 with zeros."""
 
 
 class Archive(ABC):
@@ -77,19 +88,59 @@ class Archive(ABC):
             self.close()
 
 
+def free_memory() -> int:
+    """Bytes that may still be taken: of the machine, of the control group we are in, of the limit we were given."""
+    free = int(psutil.virtual_memory().available)
+    for folder, of, now, cached in (
+        ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
+        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        with contextlib.suppress(OSError, ValueError):  # none there, or "max"
+            most, taken = (int(Path(folder, name).read_text(encoding="ascii")) for name in (of, now))
+            lines = Path(folder, "memory.stat").read_text(encoding="ascii").splitlines()
+            given_back = sum(int(line.split()[1]) for line in lines if line.startswith(f"{cached} "))
+            free = min(free, most - taken + given_back)
+    if resource is not None:
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if most != resource.RLIM_INFINITY:
+            free = min(free, most - int(psutil.Process().memory_info().vms))
+    return max(0, free)
+
+
 def guard_memory(path: Path, name: str, n_bytes: int, remedy: str) -> None:
     """Refuse to read an array whole that would not leave the machine room to breathe.
+
+    Parameters
+    ----------
+    n_bytes
+        What reading it takes at its most.
 
     Raises
     ------
     InputError
         With the remedy.
     """
-    free = int(psutil.virtual_memory().available)
+    free = free_memory()
     if n_bytes > WHOLE_SHARE * free:
         raise InputError(
-            f"{path}: array '{name}' has {n_bytes / 1e9:.1f} GB and this format can only be read whole, with "
-            f"{free / 1e9:.1f} GB of memory free; {remedy}"
+            f"{path}: {name} can only be read whole in this format, which takes {n_bytes / 1e9:.3g} GB, with "
+            f"{free / 1e9:.3g} GB of memory free; {remedy}"
+        )
+
+
+def refuse_absurd(path: Path, name: str, n_bytes: float) -> None:
+    """Refuse an array that claims to be larger than anything that was measured can be in a file of this size.
+
+    Raises
+    ------
+    InputError
+        If no packing known makes so much of so little.
+    """
+    size = path.stat().st_size
+    if n_bytes > MOST_PACKED * size + WHOLE_BYTES:
+        raise InputError(
+            f"{path}: array '{name}' claims {n_bytes / 1e9:.3g} GB in a file of {size / 1e6:.3g} MB: damaged, or "
+            "made to do harm; export it again"
         )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from twin.plant.errors import InputError
 from twin.rig.archives.base import Archive
 
-KNOWN = ".npz, .tdms, .mat, .h5, .csv (and other text tables), .parquet, .uff, .wav"
+KNOWN = ".npz, .tdms, .mat, .h5, .csv (and other text tables), .parquet, .uff, .wav, .rrd"
 
 
 def open_archive(path: Path) -> Archive:
@@ -55,6 +55,10 @@ def _opener(path: Path, start: bytes) -> Callable[[Path], Archive]:
         from twin.rig.archives.wave import WaveArchive
 
         return WaveArchive
+    if start.startswith(b"RRF"):
+        from twin.rig.archives.rerun_file import RerunArchive
+
+        return RerunArchive
     hdf = b"\x89HDF\r\n\x1a\n"
     if start.startswith(hdf) or start[512:520] == hdf or start.startswith(b"MATLAB 7.3"):
         from twin.rig.archives.matlab import HdfArchive

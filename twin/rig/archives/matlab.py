@@ -1,8 +1,8 @@
 """MATLAB files: v5 (SciPy) and v7.3, which is HDF5 (h5py); plain HDF5 files are read likewise."""
 
+import math
 import struct
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -11,7 +11,8 @@ import scipy.io
 from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
-from twin.rig.archives.base import Archive, damaged, guard_memory
+from twin.rig.archives.base import WHOLE_BYTES, Archive, damaged, guard_memory, refuse_absurd
+from twin.rig.archives.hdf_walk import datasets, elsewhere, survives
 
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError,
               MemoryError, RuntimeError, NotImplementedError, struct.error, zlib.error,
@@ -57,8 +58,10 @@ class Mat5Archive(Archive):
     def _load(self, name: str) -> NDArray[np.generic]:
         if self._loaded is not None and self._loaded[0] == name:
             return self._loaded[1]
+        claimed = 8 * math.prod(self._shapes[name])
+        refuse_absurd(self.path, name, claimed)
         guard_memory(
-            self.path, name, 8 * int(np.prod(self._shapes[name], dtype=np.int64)), "save it with -v7.3"
+            self.path, f"variable '{name}'", 3 * claimed, "save it with -v7.3, which is read in parts"
         )
         self._loaded = None
         try:
@@ -83,21 +86,45 @@ class HdfArchive(Archive):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        if why := survives(path):
+            raise InputError(f"{path}: is cut short or damaged ({why}); copy or export it again")
         try:
             self._file = h5py.File(path, "r")
-            found = list(_datasets(self._file, ""))
+            found = [(name, d) for name, d in datasets(self._file) if _is_numeric(d)]
+            self._sets = dict(found)
+            self._matlab = any("MATLAB_class" in d.attrs for _, d in found)
+            units = {name: d.attrs.get("unit", d.attrs.get("units")) for name, d in found}
+            for name, dataset in found:
+                self._refuse_to_be_led_astray(name, dataset)
+        except InputError:
+            raise
         except UNREADABLE as error:
             raise InputError(f"{path}: is cut short or damaged ({error}); copy or export it again") from error
-        self._sets = dict(found)
-        self._matlab = any("MATLAB_class" in d.attrs for d in self._sets.values())
         self.format = "MATLAB v7.3" if self._matlab else "HDF5"
         self.names = tuple(self._sets)
         if not self.names:
             raise InputError(f"{path}: holds no datasets of numbers; save the samples as plain arrays")
-        units = {name: d.attrs.get("unit", d.attrs.get("units")) for name, d in found}
         self.units = {
-            n: u.decode() if isinstance(u, bytes) else str(u) for n, u in units.items() if u is not None
+            n: u.decode(errors="replace") if isinstance(u, bytes) else str(u)
+            for n, u in units.items()
+            if u is not None
         }
+
+    def _refuse_to_be_led_astray(self, name: str, dataset: h5py.Dataset) -> None:
+        """Complain of samples in other files, and of pieces that would fill the memory."""
+        if elsewhere(dataset):
+            raise InputError(
+                f"{self.path}: dataset '{name}' lies in other files, which are not followed; save it into one file"
+            )
+        refuse_absurd(self.path, name, dataset.size * dataset.dtype.itemsize)
+        piece = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+        if piece > WHOLE_BYTES:
+            guard_memory(
+                self.path,
+                f"a chunk of dataset '{name}'",
+                2 * piece,
+                f"save it in chunks of up to {WHOLE_BYTES // 1_000_000} MB",
+            )
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape as MATLAB or the file's maker has it; a row or column vector counts as one series."""
@@ -125,15 +152,6 @@ class HdfArchive(Archive):
         self._file.close()
 
 
-def _datasets(group: h5py.Group, prefix: str) -> Iterator[tuple[str, h5py.Dataset]]:
-    for name in group:
-        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            continue  # MATLAB's own bookkeeping; and no link leads out of the file or round in circles
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            if prefix.count("/") < 8:
-                yield from _datasets(item, f"{prefix}{name}/")
-        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu":
-            kind = item.attrs.get("MATLAB_class", b"double")
-            if (kind.decode() if isinstance(kind, bytes) else str(kind)) in NUMERIC and item.shape:
-                yield f"{prefix}{name}", item
+def _is_numeric(dataset: h5py.Dataset) -> bool:
+    kind = dataset.attrs.get("MATLAB_class", b"double")
+    return (kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)) in NUMERIC

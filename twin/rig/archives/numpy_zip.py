@@ -1,6 +1,7 @@
 """NumPy's ``.npz``: a zip of ``.npy`` arrays, stored or deflated; Python objects in it are never loaded."""
 
 import io
+import math
 import struct
 import tokenize
 import warnings
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
-from twin.rig.archives.base import Archive, damaged, guard_memory
+from twin.rig.archives.base import WHOLE_BYTES, Archive, damaged, guard_memory, refuse_absurd
 
 UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, TypeError, SyntaxError, ArithmeticError, MemoryError,
@@ -22,8 +23,9 @@ UNREADABLE = (
     zlib.error,
 )  # fmt: skip
 
-WHOLE_BYTES = 64_000_000
-"""Up to this size an array is read at once, and its checksum compared before any of it is used."""
+KEPT_BYTES = 4 * WHOLE_BYTES
+"""Arrays that are small enough to be read at once, so that their checksum is compared before any of it is used, stay in
+memory up to so much together."""
 
 
 @dataclass(slots=True)
@@ -80,15 +82,25 @@ class NumpyArchive(Archive):
         if name not in self._shapes:
             try:
                 with zipfile.ZipFile(self.path) as archive, archive.open(self._members[name]) as file:
-                    self._shapes[name] = _read_header(file)
+                    shape, fortran, dtype = _read_header(file)
+                    claimed = math.prod(shape) * dtype.itemsize
+                    if claimed > self._sizes[name] and not dtype.hasobject:
+                        raise ValueError(f"it claims {claimed} bytes and has {self._sizes[name]}")
             except UNREADABLE as error:
                 raise damaged(self.path, name, error) from error
+            refuse_absurd(self.path, name, claimed)
+            self._shapes[name] = shape, fortran, dtype
         return self._shapes[name]
 
     def _at_once(self, name: str) -> NDArray[np.generic]:
         if name in self._whole:
             return self._whole[name]
-        guard_memory(self.path, name, self._sizes[name], "save it in C order, as one array per channel")
+        guard_memory(
+            self.path,
+            f"array '{name}', with time along its second dimension,",
+            3 * self._sizes[name],
+            "save it in C order, as one array per channel",
+        )
         try:
             with zipfile.ZipFile(self.path) as archive:
                 # The whole member is read first, so that its checksum is compared before anything is used.
@@ -103,6 +115,8 @@ class NumpyArchive(Archive):
                 ) from error
             raise damaged(self.path, name, error) from error
         self._whole[name] = array
+        while len(self._whole) > 1 and sum(kept.nbytes for kept in self._whole.values()) > KEPT_BYTES:
+            del self._whole[next(iter(self._whole))]
         return array
 
     def _in_turn(self, name: str, first: int, stop: int) -> NDArray[np.generic]:

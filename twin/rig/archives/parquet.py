@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from twin.plant.errors import InputError
-from twin.rig.archives.base import Archive, damaged
+from twin.rig.archives.base import Archive, damaged, refuse_absurd
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError)
 
@@ -28,10 +28,12 @@ class ParquetArchive(Archive):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         try:
-            self._file = pq.ParquetFile(path)
+            # Pages in turn: a row group of another's file may be all of it.
+            self._file = pq.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False, memory_map=False)
             schema = self._file.schema_arrow
         except UNREADABLE as error:
             raise InputError(f"{path}: is cut short or damaged ({error}); copy or export it again") from error
+        refuse_absurd(path, "any column", 8.0 * self._file.metadata.num_rows)
         numeric = [f for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
         self.names = tuple(f.name for f in numeric)
         if not self.names:

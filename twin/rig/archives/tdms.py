@@ -1,6 +1,7 @@
 """LabVIEW's TDMS, read in parts (npTDMS)."""
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,7 @@ class TdmsArchive(Archive):
                 self.units[name] = unit
             if isinstance(step_s, float | int) and step_s > 0.0:
                 self.rates_hz[name] = float(f"{1.0 / step_s:.12g}")
+        self.starts_s = _starts(self._channels)
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Number of samples."""
@@ -68,3 +70,15 @@ class TdmsArchive(Archive):
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
+
+
+def _starts(channels: Mapping[str, TdmsChannel]) -> dict[str, float]:
+    """First instants [s] from the earliest on, of the channels that state any."""
+    zero = np.datetime64("1904-01-01T00:00:00")
+    found = {}
+    for name, channel in channels.items():
+        at, offset = channel.properties.get("wf_start_time"), channel.properties.get("wf_start_offset", 0.0)
+        if isinstance(at, np.datetime64) and not np.isnat(at) and isinstance(offset, int | float):
+            found[name] = (int((at - zero) / np.timedelta64(1, "us")), float(offset))
+    begin = min((us for us, _ in found.values()), default=0)
+    return {name: (us - begin) * 1e-6 + offset for name, (us, offset) in found.items()}
