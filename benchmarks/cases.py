@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import campaign, chain, filters, observer, plant, replay, retune
+from benchmarks import campaign, chain, filters, latency, observer, plant, replay, retune
 from benchmarks.report import Report
 
 CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
@@ -13,6 +13,7 @@ CASES: dict[str, tuple[Callable[[Any], Report], Any, Any]] = {
     "chain": (chain.run_chain, chain.Setting(), chain.SMALL),
     "replay": (replay.run_replays, replay.Setting(), replay.SMALL),
     "campaign": (campaign.run_campaign_case, campaign.Setting(), campaign.SMALL),
+    "latency": (latency.run_latency, latency.Setting(), latency.SMALL),
     "retune": (retune.run_retune, retune.Setting(), retune.SMALL),
 }
 

@@ -1,84 +1,110 @@
-"""The operator page measured: slider to redrawn curves, order to first obeyed sample; and its pictures.
+"""The operator's page in Chromium: how long until a control's curves are drawn; and its pictures.
 
-Run: python benchmarks/station_page.py [--pictures docs/images]
+Time runs from the browser's own stamp of the input event until the frame with all four curves has been painted.
+
+Run for the pictures: python -m benchmarks.station_page docs/images
 """
 
 import argparse
-import json
-import sys
+import itertools
+import random
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from station_processes import station
-
+from tests.station_processes import Station, station
 from twin.station.doctor import find_browser
 
-SLIDES, ORDERS = 40, 20
-WATCH = """() => new Promise(done => {
-  const on = document.querySelector('#s-control dd').textContent, began = performance.now();
-  const tick = () => document.querySelector('#s-control dd').textContent === on
-    ? setTimeout(tick, 5) : done(performance.now() - began);
-  document.getElementById(on === 'on' ? 'off' : 'on').click(); tick(); })"""
+FLAGS = ["--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
+LISTEN = """() => {
+  window.redraws = []; window.completes = [];
+  document.addEventListener("curves-redraw", (e) => redraws.push(e.detail));
+  document.addEventListener("curves-complete", (e) => completes.push(e.detail));
+}"""
 
 
-def main() -> None:
-    """Print 50th and 95th percentiles in ms."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--pictures", type=Path)
-    pictures = parser.parse_args().pictures
-    with tempfile.TemporaryDirectory() as folder, station(Path(folder)) as both, sync_playwright() as play:
-        both.start_rig()
-        both.start_live()
-        browser = play.chromium.launch(executable_path=str(find_browser()), args=["--no-sandbox"])
+def move_latencies(both: Station, browser: Path, count: int) -> tuple[list[float], list[float]]:
+    """Move controls; returns the times [ms] until curves were drawn and, of those left alone, confirmed."""
+    with _page(both, browser) as page:
+        return _moves(page, count)
+
+
+@contextmanager
+def _page(both: Station, browser_path: Path) -> Iterator[Page]:
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=str(browser_path), args=FLAGS)
         page = browser.new_page(viewport={"width": 1600, "height": 1000})
         page.goto(both.url)
-        page.wait_for_selector("body[data-redraws]", timeout=60_000)
-        page.wait_for_timeout(3000)
-        if page.inner_text("#s-control dd") == "off":
-            page.click("#on")
-        page.wait_for_timeout(2000)
-        drawn, whole = [], []
-        page.focus("#budget")
-        for k in range(SLIDES):
-            page.keyboard.press("ArrowLeft" if k < 30 else "ArrowRight")
-            page.wait_for_timeout(900)
-            drawn.append(float(page.evaluate("document.body.dataset.redrawMs")))
-            whole.append(float(page.evaluate("document.body.dataset.completeMs")))
-        if pictures is not None:
+        page.wait_for_selector("body[data-completes]", timeout=60_000)
+        yield page
+        browser.close()
+
+
+def _moves(page: Page, count: int) -> tuple[list[float], list[float]]:
+    """Move budget, margin and cutoffs in turn, now slowly, now while the last answer is still being refined."""
+    rng = random.Random(5)  # noqa: S311 - a pattern of moves, no secret
+    moves = itertools.islice(_pattern(page), count)
+    page.evaluate(LISTEN)
+    for move in moves:
+        seen = page.evaluate("redraws.length")
+        move()
+        page.wait_for_timeout(rng.choice((60.0, 250.0, 700.0)))
+        while page.evaluate("redraws.length") == seen:
+            page.wait_for_timeout(50.0)
+    page.wait_for_timeout(500)
+    return page.evaluate("redraws"), page.evaluate("completes")
+
+
+def _pattern(page: Page) -> Iterator[Callable[[], None]]:
+    def press(control: str, key: str) -> Callable[[], None]:
+        return lambda: page.locator(control).press(key)
+
+    def fill(control: str, value: float) -> Callable[[], None]:
+        return lambda: page.fill(control, f"{value:g}")
+
+    while True:
+        yield from [press("#budget", "ArrowLeft")] * 25
+        yield from [press("#margin", "ArrowRight")] * 10
+        yield from (fill("#low", 150.0 + 10.0 * k) for k in range(3))
+        yield from (fill("#high", 2.0 - 0.2 * k) for k in range(3))
+        yield from [press("#budget", "ArrowRight")] * 25
+        yield from [press("#margin", "ArrowLeft")] * 10
+        yield from (fill(c, v) for c, v in (("#excitation", 3.5), ("#c2", 9.0)))
+        yield lambda: page.click("#reset")
+
+
+def draw_pictures(folder: Path) -> None:
+    """Have a person's way through the page drawn: review, what was achieved, on a tablet."""
+    browser = find_browser()
+    if browser is None:
+        raise SystemExit("no Chromium was found: see atmd doctor")
+    with tempfile.TemporaryDirectory() as run, station(Path(run)) as both:
+        both.start_rig()
+        both.start_live()
+        with _page(both, browser) as page:
+            page.wait_for_timeout(5000)
+            if page.inner_text("#s-control dd") == "off":
+                page.click("#on")
+                page.wait_for_timeout(2000)
             page.click("#propose")
             page.wait_for_selector("#arm:enabled", timeout=30_000)
-            page.screenshot(path=pictures / "station-review.png")
+            page.screenshot(path=folder / "station-review.png")
             page.click("#arm")
             page.wait_for_selector("#send:enabled")
             page.click("#send")
             page.wait_for_timeout(6000)
             page.click("#branch")
             page.wait_for_timeout(5000)
-            page.screenshot(path=pictures / "station-achieved.png", full_page=True)
+            page.screenshot(path=folder / "station-achieved.png", full_page=True)
             page.set_viewport_size({"width": 820, "height": 1180})
             page.wait_for_timeout(1000)
-            page.screenshot(path=pictures / "station-tablet.png")
-        obeyed = []
-        for _ in range(ORDERS):
-            page.wait_for_timeout(700)
-            obeyed.append(float(page.evaluate(WATCH)))
-        browser.close()
-
-    def figures(values: list[float]) -> dict[str, float]:
-        return {f"p{p}": round(float(np.percentile(values, p)), 1) for p in (50, 95)}
-
-    result = {
-        "slider_to_redrawn_ms": figures(drawn),
-        "slider_to_all_proposed_ms": figures(whole),
-        "order_to_shown_ms": figures(obeyed),
-    }
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+            page.screenshot(path=folder / "station-tablet.png")
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    draw_pictures(parser.parse_args().folder)

@@ -56,7 +56,7 @@ def test_budget_moved_reviewed_sent_obeyed_audited_and_taken_back(
             script = "document.getElementById('chart-motion').data.find(t => t.name === 'proposed').y"
             return list(page.evaluate(script))
 
-        page.wait_for_selector("body[data-complete-ms]")
+        page.wait_for_selector("body[data-completes]")
         page.wait_for_timeout(1500)
         before = proposed()
         page.focus("#budget")

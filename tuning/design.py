@@ -43,7 +43,48 @@ class Design:
     gains: Gains
     active: tuple[ActiveLimit, ...]
     found: Found
-    grid: Array | None
+    grid: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a search may begin: gains (3,) in SI units and, of a question in the same situation, what came of it.
+
+    Attributes
+    ----------
+    design, demands
+        What was found for which demands; None where gains and situation do not belong together.
+    """
+
+    numbers: Array
+    design: Design | None = None
+    demands: Demands | None = None
+
+    def still_holds(self, demands: Demands) -> bool:
+        """Whether other demands leave the design the best next to itself: none that changed binds it.
+
+        What did not bind may do so now: the gains need verifying.
+        """
+        before = self.demands
+        if self.design is None or before is None:
+            return False
+        if demands == before:
+            return True
+        if (demands.displacement_m is None) != (before.displacement_m is None):
+            return False  # another thing is to be small
+        ours, theirs = demands.limits, before.limits
+        moved = {
+            "power": ours.joule_mean_w != theirs.joule_mean_w,
+            "electrical": ours.electrical_mean_w != theirs.electrical_mean_w,
+            "current": ours.current_peak_a != theirs.current_peak_a,
+            "stroke": ours.stroke_m != theirs.stroke_m,
+            "voltage": ours.voltage_peak_v != theirs.voltage_peak_v,
+            "displacement": demands.displacement_m != before.displacement_m,
+            "modulus margin": (demands.modulus_margin, demands.delay_margin_s)
+            != (before.modulus_margin, before.delay_margin_s),
+            "decay": demands.slowest_decay_1_s != before.slowest_decay_1_s,
+        }
+        return not any(moved[name] for name in self.design.found.binding if name in moved)
 
 
 def not_stopped() -> None:
@@ -76,8 +117,7 @@ class Designer:
         demands: Demands,
         wish_a: complex,
         *,
-        near: Array | None = None,
-        grid: Array | None = None,
+        near: Start | None = None,
         go_on: Callable[[], None] = not_stopped,
     ) -> Design:
         """Gains with the least motion or, with a displacement asked for, the least power that reaches it.
@@ -86,16 +126,16 @@ class Designer:
         ----------
         wish_a
             Reference at the physical limit [A].
-        near, grid
-            Gains (3,) in SI units to start from and nowhere else, such as those of a slightly different question, and
-            the frequencies [Hz] that were looked at for them. Quick, but it may miss better gains farther off.
+        near
+            Where to start and nowhere else, such as at the gains of a slightly different question. Quick, but it may
+            miss better gains farther off.
         go_on
             Called before each search; what it raises ends this.
         """
         if demands.displacement_m is not None:
             kind: BudgetKind = "electrical" if demands.limits.electrical_mean_w < math.inf else "joule_mean"
-            return self._search(situation, cutoffs_hz, demands, wish_a, kind, near, grid, go_on)
-        return self._search(situation, cutoffs_hz, demands, wish_a, None, near, grid, go_on)
+            return self._search(situation, cutoffs_hz, demands, wish_a, kind, near, go_on)
+        return self._search(situation, cutoffs_hz, demands, wish_a, None, near, go_on)
 
     def least_power(
         self,
@@ -119,16 +159,15 @@ class Designer:
         demands: Demands,
         wish_a: complex,
         kind: BudgetKind | None,
-        near: Array | None = None,
-        grid: Array | None = None,
+        near: Start | None = None,
         go_on: Callable[[], None] = not_stopped,
     ) -> Design:
         conditions, unit = self._conditions(situation, cutoffs_hz, demands, kind)
         left = abs(situation.paths.motion[0] * wish_a + situation.paths.motion[1]) / unit
         enough = 0.0 if kind is not None else left**2 * (1.0 + 2.0 * NEXT_TO_LIMIT) + NEXT_TO_LIMIT**2
-        grid = situation.design_grid if grid is None else grid
+        grid = situation.design_grid if near is None or near.design is None else near.design.grid
         margin, late = demands.modulus_margin * (1.0 + INSIDE) + 1e-6, LATE_MARGIN
-        first: list[Array] | None = None if near is None else [near]
+        first: list[Array] | None = None if near is None else [near.numbers]
         for tightening in range(TIGHTENINGS):
             terms = situation.loop_terms(grid, cutoffs_hz)
             stability = self._stability(situation, grid, cutoffs_hz, demands, terms, margin, late)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from tuning.design import Design, Designer, not_stopped
+from tuning.design import Design, Designer, Start, not_stopped
 from tuning.limit import CoilLimits, LimitResult, least_power, physical_limit
 from tuning.loop import LoopFacts, Margins
 from tuning.steady import Prediction, SteadyPaths, predict
@@ -221,6 +221,11 @@ class Retuner:
         )
 
     @property
+    def demands(self) -> Demands:
+        """What gains must keep."""
+        return self._demands
+
+    @property
     def designer(self) -> Designer:
         """Of this plant; what it answers depends on nothing it was asked before."""
         return self._designer
@@ -268,7 +273,7 @@ class Retuner:
         self,
         situation: Situation,
         in_use: Gains,
-        near: Sequence[Design] | None = None,
+        near: Sequence[Start] | None = None,
         go_on: Callable[[], None] = not_stopped,
     ) -> tuple[OperatingPoint, Design | None]:
         """What `propose` proposes for one operating point, in a situation that is there already.
@@ -280,9 +285,8 @@ class Retuner:
         in_use
             Gains in use, behind the cutoffs that are meant.
         near
-            Designs of questions that differ little, without a ``grid`` if they are of another situation: the first
-            whose neighbourhood has verified gains is taken, and nowhere else is searched. All that is stated is
-            verified; better gains farther off may be missed.
+            Where to search and nowhere else, such as at the gains of questions that differ little: the first start with
+            verified gains in its neighbourhood is taken. Better ones farther off may be missed.
         go_on
             Called between searches; what it raises ends this.
 
@@ -309,19 +313,29 @@ class Retuner:
         return self._or_in_use(situation, in_use, point), design
 
     def _nearby(
-        self, situation: Situation, in_use: Gains, near: Sequence[Design], go_on: Callable[[], None]
+        self, situation: Situation, in_use: Gains, near: Sequence[Start], go_on: Callable[[], None]
     ) -> tuple[OperatingPoint, Design]:
         try:
             best = physical_limit(situation.paths, self._limits)
         except RunError as error:
             raise NoGainsError(str(error), ()) from error
         cutoffs, trouble = (in_use.low_pass_hz, in_use.high_pass_hz), "not worked out yet"
-        for known in near:
-            design = self._designer.design(
-                situation, cutoffs, self._demands, best.reference_a,
-                near=known.found.numbers, grid=known.grid, go_on=go_on,
-            )  # fmt: skip
-            verdict = verify(situation, design.gains, self._demands)
+        for start in near:
+            known = start.design
+            if known is not None and start.still_holds(self._demands):
+                verdict = verify(situation, known.gains, self._demands)
+                if not verdict.trouble:
+                    active = (*best.active, *known.active)
+                    return self._describe(situation, known.gains, best, verdict, active, kept=False), known
+            # The poles cost the search most and seldom bind: they are looked at afterwards, and if need be on the way.
+            for slowest in (0.0, self._demands.slowest_decay_1_s):
+                demands = replace(self._demands, slowest_decay_1_s=slowest)
+                design = self._designer.design(
+                    situation, cutoffs, demands, best.reference_a, near=start, go_on=go_on
+                )
+                verdict = verify(situation, design.gains, self._demands)
+                if verdict.broken != "decay":
+                    break
             if not verdict.trouble:
                 active = (*best.active, *design.active)
                 return self._describe(situation, design.gains, best, verdict, active, kept=False), design

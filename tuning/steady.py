@@ -42,6 +42,16 @@ class SteadyPaths:
     voltage: Pair
     resistance_ohm: float
 
+    def scaled(self, share: float) -> "SteadyPaths":
+        """The same under an excitation of another size, as a share of this one."""
+        motion, stroke, acceleration, current, voltage = (
+            (pair[0], share * pair[1])
+            for pair in (self.motion, self.stroke, self.acceleration, self.current, self.voltage)
+        )
+        return SteadyPaths(
+            self.frequency_hz, motion, stroke, acceleration, current, voltage, self.resistance_ohm
+        )
+
     def at(self, reference_a: complex) -> "Prediction":
         """Steady state with a reference phasor [A]."""
         motion, stroke, current, voltage = (

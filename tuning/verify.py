@@ -4,6 +4,7 @@ No solver's word is taken: poles, modulus and delay margin, motion, stroke, curr
 excitation and beside it, at the damping and two standard deviations off.
 """
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -75,6 +76,13 @@ class Situation:
         for model in self.models[1:]:
             response = model.response(frequency_hz)[0]
             self.cases.append((model, paths_from(model, frequency_hz, response, amplitude)))
+
+    def scaled(self, amplitude: float) -> "Situation":
+        """The same under another size of excitation, with what is known of models and gains."""
+        new = copy.copy(self)
+        share, new.amplitude = amplitude / self.amplitude, amplitude
+        new.cases = [(model, paths.scaled(share)) for model, paths in self.cases]
+        return new
 
     @property
     def paths(self) -> SteadyPaths:

@@ -12,9 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import numpy as np
+
 from tuning.changes import Changes
-from tuning.design import Design as Searched
-from tuning.design import Designer, not_stopped
+from tuning.design import Designer, Start, not_stopped
 from tuning.limit import LimitResult, physical_limit
 from tuning.loop import LoopFacts, RigModel, margin_grid, margins
 from tuning.retune import NoGainsError, Retuner, TuningGoal, predict
@@ -145,8 +146,12 @@ class WhatIf:
         self._situations: dict[_Place, Situation] = {}
         self._as_used: dict[tuple[_Place, Gains | None], Design] = {}
         self._answers: dict[_Asked, _Answer] = {}
-        self._last: dict[float, tuple[_Place, tuple[float, float], Searched]] = {}
+        self._last: dict[float, tuple[_Place, tuple[float, float], Start]] = {}
         self._tuner(plant, plant.fingerprint, goal)
+
+    def begin_like(self, other: "WhatIf") -> None:
+        """Seek quick answers next to what another one found last, of a rig that differs little."""
+        self._last = dict(other._last)
 
     def curves(
         self,
@@ -237,7 +242,7 @@ class WhatIf:
         if known is not None and (quick or not known.provisional):
             return known
         cutoffs = meant.low_pass_hz, meant.high_pass_hz
-        near = self._near(place, cutoffs) if quick else None
+        near = self._near(place, meant) if quick else None
         try:
             point, searched = tuner.settle(situation, meant, near, go_on)
         except NoGainsError as error:
@@ -245,18 +250,19 @@ class WhatIf:
         else:
             answer = _Answer(self._design_of(situation, point), point, "", quick)
             if searched is not None:
-                self._last[f] = place, cutoffs, searched
+                self._last[f] = place, cutoffs, Start(searched.found.numbers, searched, tuner.demands)
         _keep(self._answers, question, answer, KEPT_ANSWERS)
         return answer
 
-    def _near(self, place: "_Place", cutoffs: tuple[float, float]) -> list[Searched]:
-        """What was found last at this frequency, and next to it."""
-        others = sorted(self._last, key=lambda f: abs(f - place.frequency_hz))
+    def _near(self, place: "_Place", meant: Gains) -> list[Start]:
+        """What was found last at this frequency, and next to it; the gains in use where nothing was."""
         out = []
-        for f in others[:NEAREST]:
-            where, filters, searched = self._last[f]
-            same = where == place and filters == cutoffs
-            out.append(searched if same else replace(searched, grid=None))
+        for f in sorted(self._last, key=lambda f: abs(f - place.frequency_hz))[:NEAREST]:
+            where, cutoffs, start = self._last[f]
+            same = where == place and cutoffs == (meant.low_pass_hz, meant.high_pass_hz)
+            out.append(start if same else Start(start.numbers))
+        if place.frequency_hz not in self._last:
+            out.append(Start(np.array([meant.alpha_kg, meant.beta_ns_m, meant.gamma_n_m])))
         return out
 
     def _design_in_use(
@@ -309,8 +315,18 @@ class WhatIf:
     def _situation(self, plant: Plant, place: "_Place") -> Situation:
         known = self._situations.get(place)
         if known is None:
-            known = Situation(
-                plant, self.facts, place.frequency_hz, place.amplitude, self.damping_std_ns_m, place.drift_hz
+            alike = next((s for p, s in self._situations.items() if p.is_like(place)), None)
+            known = (
+                alike.scaled(place.amplitude)
+                if alike is not None
+                else Situation(
+                    plant,
+                    self.facts,
+                    place.frequency_hz,
+                    place.amplitude,
+                    self.damping_std_ns_m,
+                    place.drift_hz,
+                )
             )
             _keep(self._situations, place, known, KEPT_SITUATIONS)
         return known
@@ -324,6 +340,10 @@ class _Place:
     frequency_hz: float
     amplitude: float
     drift_hz: float
+
+    def is_like(self, other: "_Place") -> bool:
+        """Whether nothing but the excitation's size differs."""
+        return replace(self, amplitude=other.amplitude) == other
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,7 @@ FILES = {
     "page.js": "text/javascript; charset=utf-8",
     "status.js": "text/javascript; charset=utf-8",
     "charts.js": "text/javascript; charset=utf-8",
+    "curves.js": "text/javascript; charset=utf-8",
     "orders.js": "text/javascript; charset=utf-8",
     "player.js": "text/javascript; charset=utf-8",
     "icon.svg": "image/svg+xml",

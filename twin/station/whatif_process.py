@@ -1,7 +1,7 @@
 """What-if for the operator page, in a process of its own: neither loop nor page waits for a solver.
 
-Curves come piece by piece, the cheap lines first and the proposed gains from coarse to fine, so that a slider can be
-followed; a newer question ends an older one.
+All curves come at once, with gains sought next to those of the question before so that a slider can be followed, and
+then, from coarse to fine, what the tuner's whole search makes of the provisional points; a newer question ends that.
 """
 
 import contextlib
@@ -169,16 +169,15 @@ class WhatIfProcess:
 def _serve(connection: "Connection[Any, Any]") -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(5)
-    worker = _Worker()
+        os.nice(1)
+    worker = _Worker(connection)
     with contextlib.suppress(EOFError, OSError):
         while True:
             number, asked = connection.recv()
             try:
-                for part in worker.answer(asked):
-                    connection.send((number, "part", part))
-                    if asked.kind == "curves" and connection.poll(0):
-                        break
+                with contextlib.suppress(_SupersededError):
+                    for part in worker.answer(asked):
+                        connection.send((number, "part", part))
                 connection.send((number, "end", None))
             except InputError as error:
                 connection.send((number, "unusable", str(error)))
@@ -186,29 +185,48 @@ def _serve(connection: "Connection[Any, Any]") -> None:
                 connection.send((number, "failed", f"{type(error).__name__}: {error}"))
 
 
+class _SupersededError(Exception):
+    """A newer question has come."""
+
+
 class _Worker:
-    def __init__(self) -> None:
+    def __init__(self, connection: "Connection[Any, Any]") -> None:
+        self._connection = connection
         self._base: Base | None = None
         self._what_if: WhatIf | None = None
 
     def answer(self, asked: Asked) -> Iterator[Any]:
         match asked.kind:
             case "curves":
-                what_if = self._for(asked.base)
-                yield what_if.curves(asked.frequencies_hz, asked.changes, propose=False)
-                for k in coarse_to_fine(len(asked.frequencies_hz)):
-                    yield k, what_if.curves(asked.frequencies_hz[k : k + 1], asked.changes).points[0]
+                yield from self._curves(asked)
             case "propose":
                 yield self._proposal(asked)
             case "branch":
                 yield self._branches(asked)
 
+    def _curves(self, asked: Asked) -> Iterator[Any]:
+        what_if, band = self._for(asked.base), asked.frequencies_hz
+        quick = what_if.curves(band, asked.changes, quick=True)
+        yield quick
+        # Holes first: points without gains next to the last ones may have some elsewhere.
+        open_points = [k for k in coarse_to_fine(len(band)) if quick.points[k].provisional]
+        for k in sorted(open_points, key=lambda k: quick.points[k].proposed is not None):
+            self._go_on()
+            yield k, what_if.curves(band[k : k + 1], asked.changes, go_on=self._go_on).points[0]
+
+    def _go_on(self) -> None:
+        if self._connection.poll(0):
+            raise _SupersededError
+
     def _for(self, base: Base) -> WhatIf:
         if self._what_if is None or self._base is None or not base.is_like(self._base):
+            before = self._what_if
             self._base = base
             self._what_if = WhatIf(
                 base.plant, base.facts, base.schedule, base.goal, base.amplitude, base.damping_std_ns_m
             )
+            if before is not None:
+                self._what_if.begin_like(before)
         return self._what_if
 
     def _proposal(self, asked: Asked) -> "WhatIfProposal":

@@ -10,7 +10,7 @@ const OPTIONS = { displayModeBar: false, responsive: true };
 
 function line(kind, x, y) {
   const look = LOOK[kind];
-  const trace = { x, y, name: look.name, mode: look.symbol ? "lines+markers" : "lines", line: { color: css(look.color), dash: look.dash, width: 2.5 }, connectgaps: kind === "new" };
+  const trace = { x, y, name: look.name, mode: look.symbol ? "lines+markers" : "lines", line: { color: css(look.color), dash: look.dash, width: 2.5 } };
   if (look.symbol) trace.marker = { symbol: look.symbol, size: 8 };
   return trace;
 }
@@ -28,17 +28,64 @@ function layout(x, y, log) {
 const um = (v) => (v === null || v === undefined ? null : Math.max(1e6 * v, 0.01));
 let now = null;
 
-export function drawCurves(c, everything) {
+// Axes keep still while a line moves: they change in steps, and only where the lines leave them or fill little of them.
+const drawn = { motion: null, power: null, damping: "" };
+function decades(values, shown) {
+  const logs = values.filter((v) => v > 0).map(Math.log10);
+  if (!logs.length) return shown ?? [-2, 3];
+  const low = Math.floor(2 * Math.min(...logs)) / 2, high = Math.ceil(2 * Math.max(...logs) + 0.2) / 2;
+  return shown && shown[0] <= low && shown[1] >= high && shown[1] - shown[0] <= high - low + 1 ? shown : [low - 0.1, high];
+}
+function upward(values, shown) {
+  const high = 1.04 * Math.max(...values.filter((v) => v > 0), 1e-6);
+  if (shown && shown[1] >= high && shown[1] <= 4 * high) return shown;
+  const decade = 10 ** Math.floor(Math.log10(high));
+  return [0, decade * [1, 1.5, 2, 3, 5, 7, 10].find((step) => step * decade >= high)];
+}
+
+// Plotly lays a chart out anew only where its axes change; else it moves the lines, which takes a twentieth of the time.
+function draw(name, traces, axes, y) {
+  const before = drawn[name], y0 = before?.range, flat = traces.flatMap((t) => t.y);
+  const range = y === "log" ? decades(flat, y0) : upward(flat, y0);
+  const form = JSON.stringify([range, traces.map((t) => [t.name, t.marker?.size]), traces[0].x]);
+  if (before?.form === form) {
+    const data = traces.map((t) => (t.marker ? { x: t.x, y: t.y, marker: t.marker } : { x: t.x, y: t.y }));
+    const at_once = { transition: { duration: 0 }, frame: { duration: 0, redraw: false }, mode: "immediate" };
+    Plotly.animate(`chart-${name}`, { data, traces: traces.map((_, k) => k) }, at_once).catch(() => {}); // a newer one came
+    return;
+  }
+  drawn[name] = { form, range };
+  axes.yaxis = { ...axes.yaxis, range: [...range], autorange: false };
+  Plotly.react(`chart-${name}`, traces, { ...axes, uirevision: form, datarevision: performance.now() }, OPTIONS);
+}
+
+export function drawCurves(c) {
   const f = c.points.map((p) => p.frequency_hz);
   const of = (which, key) => c.points.map((p) => p[which]?.[key] ?? null);
+  const open = c.points.map((p) => (p.provisional ? "diamond-open" : "diamond"));
+  const proposed = (y) => {
+    const trace = line("new", f, y);
+    return { ...trace, marker: { ...trace.marker, symbol: open } };
+  };
   const motion = [
     line("passive", f, c.points.map((p) => um(p.passive_m))),
     line("limit", f, c.points.map((p) => um(p.limit_m))),
     line("use", f, of("in_use", "displacement_m").map(um)),
-    line("new", f, of("proposed", "displacement_m").map(um)),
+    proposed(of("proposed", "displacement_m").map(um)),
   ];
-  const power = [line("use", f, of("in_use", "power_w")), line("new", f, of("proposed", "power_w"))];
+  const power = [line("use", f, of("in_use", "power_w")), proposed(of("proposed", "power_w"))];
   power.push({ x: [f[0], f.at(-1)], y: [c.budget_w, c.budget_w], mode: "lines", name: "budget", line: { color: "#fff", width: 1, dash: "longdash" } });
+  const cross = { mode: "markers", name: "measured now", marker: { symbol: "cross-thin", size: 14, line: { width: 2.5, color: "#fff" } } };
+  motion.push({ x: [now?.f ?? null], y: [um(now?.x)], ...cross });
+  power.push({ x: [now?.f ?? null], y: [now?.p ?? null], ...cross });
+  draw("motion", motion, layout("excitation [Hz]", "table motion |x1|, peak [µm]", true), "log");
+  draw("power", power, layout("excitation [Hz]", "coil power [W]"), "linear");
+}
+
+export function drawDamping(c) {
+  const f = c.points.map((p) => p.frequency_hz), form = JSON.stringify([c.learned, f, c.points.map((p) => p.damping_ns_m)]);
+  if (form === drawn.damping) return;
+  drawn.damping = form;
   const damping = [];
   if (c.learned) {
     const l = c.learned, up = l.damping_ns_m.map((v, k) => v + l.std_ns_m[k]), down = l.damping_ns_m.map((v, k) => v - l.std_ns_m[k]);
@@ -46,14 +93,7 @@ export function drawCurves(c, everything) {
     damping.push({ ...line("use", l.frequency_hz, l.in_use_ns_m), mode: "lines", name: "in use" });
   }
   damping.push({ ...line("new", f, c.points.map((p) => p.damping_ns_m)), name: "in this what-if" });
-  if (now) {
-    const cross = { mode: "markers", name: "measured now", marker: { symbol: "cross-thin", size: 14, line: { width: 2.5, color: "#fff" } } };
-    motion.push({ x: [now.f], y: [um(now.x)], ...cross });
-    power.push({ x: [now.f], y: [now.p], ...cross });
-  }
-  Plotly.react("chart-motion", motion, { ...layout("excitation [Hz]", "table motion |x1|, peak [µm]", true), datarevision: performance.now() }, OPTIONS);
-  Plotly.react("chart-power", power, layout("excitation [Hz]", "coil power [W]"), OPTIONS);
-  if (everything) Plotly.react("chart-damping", damping, layout("excitation [Hz]", "c2 [Ns/m]"), OPTIONS);
+  Plotly.react("chart-damping", damping, layout("excitation [Hz]", "c2 [Ns/m]"), OPTIONS);
 }
 
 export function showNow(state) {

@@ -1,5 +1,6 @@
 // The page's centre: calls to the station, the stream of states, and the what-if that follows the controls.
-import { drawBranch, drawCurves, showNow } from "/page/charts.js";
+import { drawBranch, showNow } from "/page/charts.js";
+import { redraw } from "/page/curves.js";
 import { follow, start } from "/page/orders.js";
 import { showPlayer, start as startPlayer } from "/page/player.js";
 import { addRows, showStatus } from "/page/status.js";
@@ -16,7 +17,7 @@ export const drop = (element, text) => { if (element.textContent !== text) { ele
 let state = {};
 export const seen = () => state.sample ?? 0;
 
-async function post(path, body, signal) {
+export async function post(path, body, signal) {
   const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body), signal });
   if (!answer.ok) {
     const reason = await answer.json().then((r) => r.reason, () => answer.statusText);
@@ -50,60 +51,6 @@ function fromGoal(goal) {
   $("kind").value = goal.budget_kind;
   $("margin").value = String(goal.modulus_margin);
   showSettings();
-}
-
-let curves = null, busy = false, wanted = false, since = 0;
-async function redraw() {
-  wanted = true;
-  if (busy || !state.what_if) return;
-  busy = true;
-  while (wanted) {
-    wanted = false;
-    const began = since || performance.now();
-    since = 0;
-    try {
-      await follow_curves(await post("/api/whatif", { changes: settings() }), began);
-    } catch (error) {
-      put("whatif-state", error.message);
-    }
-  }
-  busy = false;
-}
-
-async function follow_curves(answer, began) {
-  const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
-  let text = "", first = null, drawn = 0, whole = false;
-  for (;;) {
-    const { done, value } = await reader.read();
-    if (done) break;
-    const lines = (text + value).split("\n");
-    text = lines.pop();
-    for (const line of lines.map((l) => JSON.parse(l))) {
-      if (line.points) {
-        const old = curves;
-        curves = line;
-        if (old && old.points.length === line.points.length) line.points.forEach((p, k) => { p.proposed = old.points[k].proposed; });
-      } else if (line.point) curves.points[line.k] = line.point;
-      else if (line.reason) put("whatif-state", line.reason);
-    }
-    if (!curves) continue;
-    const due = performance.now();
-    if (first === null || due - drawn > 120) { // drawing costs as much as an answer
-      drawCurves(curves, first === null);
-      first ??= performance.now() - began;
-      drawn = performance.now();
-      whole = false;
-    } else whole = true;
-    if (wanted) { await reader.cancel(); break; } // a newer setting: the rest of this one is of no use
-  }
-  if (whole) drawCurves(curves, false);
-  const without = curves ? curves.points.filter((p) => p.reason).length : 0;
-  put("whatif-state", without ? `No gains at ${without} of ${curves.points.length} frequencies: ${curves.points.find((p) => p.reason).reason}` : "");
-  if (first !== null) {
-    document.body.dataset.redrawMs = first.toFixed(1);
-    document.body.dataset.completeMs = (performance.now() - began).toFixed(1);
-    document.body.dataset.redraws = String(Number(document.body.dataset.redraws ?? 0) + 1);
-  }
 }
 
 let branchNumber = 0, branchShown = [];
@@ -203,11 +150,10 @@ function take(s) {
 
 $("controls").addEventListener("input", (event) => {
   touched.add(event.target.name);
-  since = performance.now();
   showSettings();
-  redraw();
+  if (state.what_if) redraw(event.timeStamp);
 });
-$("controls").addEventListener("reset", () => setTimeout(() => { touched = new Set(); if (state.goal) fromGoal(state.goal); redraw(); }));
+$("controls").addEventListener("reset", () => setTimeout(() => { touched = new Set(); if (state.goal) fromGoal(state.goal); if (state.what_if) redraw(); }));
 $("branch").addEventListener("click", branch);
 $("with-passive").addEventListener("change", () => branchShown.length && showBranch(...branchShown));
 $("show-viewer").addEventListener("click", () => openViewer($("show-viewer").getAttribute("aria-expanded") !== "true"));
