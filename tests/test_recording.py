@@ -421,6 +421,22 @@ def test_a_bit_that_fell_over_is_found(tmp_path: Path) -> None:
         next(blocks)
 
 
+def test_damage_inside_a_file_costs_the_rows_it_hit_and_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    written = a_run(path)
+    data = bytearray(path.read_bytes())
+    at = data.index(written[7].values.astype("<f4").tobytes()[:64])
+    data[at - 900 : at - 40] = bytes(860)  # what says where the rows of block 7 lie, and not the rows
+    path.write_bytes(data)
+    recording = open_recording(path)
+    assert recording.repaired
+    assert recording.damaged_rows == 1
+    kept = list(recording.blocks())
+    assert [b.first_sample // 500 for b in kept] == [k for k in range(20) if k != 7]
+    for block in kept:
+        assert_same_block(a_block(block.first_sample), block)
+
+
 def test_a_recording_that_another_tool_rearranged_reads_the_same(tmp_path: Path) -> None:
     path, other = tmp_path / "run.rrd", tmp_path / "other.rrd"
     written = a_run(path)
@@ -518,6 +534,51 @@ def test_a_disk_that_is_slow_to_confirm_costs_no_block(
     read = open_recording(path)
     assert read.finished
     assert read.n_blocks == 2
+
+
+WITHOUT_PIPES = """
+import os, signal, sys
+from pathlib import Path
+sys.modules["fcntl"] = sys.modules["termios"] = None  # as on Windows: importing them fails
+sys.path.insert(0, sys.argv[2])
+from test_recording import Storage, a_block, a_recorder
+from twin.rig import filesink
+assert filesink.FilePipe is None
+recorder = a_recorder(Path(sys.argv[1]), storage=Storage(rotate_bytes=60_000, keep_free_bytes=0))
+for k in range(30):
+    recorder.write_block(a_block(k * 500))
+    recorder.write_note("events", k * 500, "{}")
+if sys.argv[3] == "kill":
+    os.kill(os.getpid(), signal.SIGKILL)
+recorder.close()
+"""
+
+
+@pytest.mark.parametrize("end", ["close", "kill"])
+def test_where_there_are_no_pipes_rerun_writes_the_file_itself(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "run.rrd"
+    command = [sys.executable, "-c", WITHOUT_PIPES, str(path), str(Path(__file__).parent), end]
+    subprocess.run(command, check=end == "close", capture_output=True)
+    recording = open_recording(path)
+    read = list(recording.blocks())
+    assert len(recording.parts) > 2
+    assert len(read) == 30 if end == "close" else len(read) >= 29
+    for k, block in enumerate(read):
+        assert_same_block(a_block(k * 500), block)
+    assert recording.finished is (end == "close")
+
+
+def test_a_run_whose_next_file_has_no_row_yet_is_read_up_to_there(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    written = a_run_in_parts(path, Storage(rotate_s=0.045))
+    number = len(list(tmp_path.glob("*.rrd")))
+    for content in (b"", b"RRF2" + bytes(8)):  # killed just after it was begun
+        part_path(path, number + 1).write_bytes(content)
+        recording = open_recording(path)
+        assert not recording.finished
+        assert len(recording.parts) == number
+        for a, b in zip(written, recording.blocks(), strict=True):
+            assert_same_block(a, b)
 
 
 def test_closing_does_not_wait_for_a_forked_child(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from twin.control.schedule import Acknowledgement, Command
 from twin.plant.blocks import Block, Channel
 from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
-from twin.rig.filepipe import FilePipe
+from twin.rig.filesink import open_sink
 from twin.rig.storage import Storage, as_size, free_bytes, part_path, parts_beside
 
 APPLICATION = "atmd_twin"
@@ -276,7 +276,7 @@ class Recorder:
         self.part += 1
         self._first_sample = None
         self._file = part_path(self.path, self.part)
-        self._pipe = FilePipe(self._file, overwrite=self._overwrite)
+        self._pipe = open_sink(self._file, overwrite=self._overwrite)
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(self._pipe.inlet)
         self._pipe.inlet_taken()
