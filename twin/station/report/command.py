@@ -89,9 +89,10 @@ def report(
     options = replay_options(plant, channel, sample_rate, sidecar, recompute=recompute, yes=yes)
     with progress_bar("report") as progress:
         run = replayed(file, options, say, progress, name_of(file))
-        said = document(run)
+    said = document(run)
+    with progress_bar("page") as progress:
         if html is not None:
-            write_page(html, filed_page(run, said))
+            write_page(html, filed_page(run, said, progress))
         if plot is not None:
             save_plots(plots_of(run), plot)
     write_result(said, report_table, json_to)

@@ -92,9 +92,9 @@ def compare(
             runs.append(replayed(file, own if plant and is_own(file) else options, say, progress, name))
     found = compare_runs(runs, by.value, step)
     said = as_data(found)
-    with progress_bar("page"):
+    with progress_bar("page") as progress:
         if html is not None:
-            write_page(html, comparison_page(found, said))
+            write_page(html, comparison_page(found, said, progress))
         if plot is not None:
             save_plots(comparison_plots(found), plot)
     write_result(said, lambda result: comparison_tables(found, result), json_to)

@@ -1,6 +1,6 @@
 """Runs side by side, as a page and as tables in the terminal."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rich.console import Group
@@ -10,7 +10,7 @@ from rich.table import Table
 from twin.station.report.compare_plots import comparison_plots
 from twin.station.report.compared import SIGNIFICANT, Comparison
 from twin.station.report.differences import shown
-from twin.station.report.figures import HOVER, as_html
+from twin.station.report.figures import HOVER, all_as_html, no_progress
 from twin.station.report.page import Html, badge, element, join, page, section, table
 from twin.station.report.words import quantity, seconds, share, size
 
@@ -24,13 +24,17 @@ MOST_SETTINGS = 40
 LEVELS = {"error": "bad", "warning": "warn", "info": "open"}
 
 
-def comparison_page(c: Comparison, said: dict[str, Any]) -> str:
+def comparison_page(
+    c: Comparison, said: dict[str, Any], progress: Callable[[int, int], None] = no_progress
+) -> str:
     """The whole page.
 
     Parameters
     ----------
     said
         `twin.station.report.compared.as_data` of the comparison.
+    progress
+        Takes plots drawn and plots in all.
     """
     names = [run.name for run in c.runs]
     title = " and ".join(names) if len(names) == 2 else f"{len(names)} runs"
@@ -47,7 +51,7 @@ def comparison_page(c: Comparison, said: dict[str, Any]) -> str:
         *(_not_whole(run) for run in said["runs"]),
         element("nav", links, aria_label="Sections"),
         section("Figures", "figures", _figures(said, names), _differences(c, said)),
-        section("Plots", "plots", join(as_html(plot) for plot in comparison_plots(c))),
+        section("Plots", "plots", all_as_html(comparison_plots(c), progress)),
         section("Runs", "runs", _runs(said)),
         section("Configuration", "configuration", _configuration(said, names)),
         section("Gains in use in the end", "gains", _gains(said, names)),

@@ -6,8 +6,9 @@ from matplotlib.figure import Figure
 
 from twin.plant.linear import Array
 from twin.station.report.compared import SIGNIFICANT, Comparison, Line
+from twin.station.report.event_plots import lanes_of, shade_states
 from twin.station.report.figures import Plot
-from twin.station.report.plots import DWELL_HZ, draw_curve, lanes_of, shade_states
+from twin.station.report.plots import DWELL_HZ, draw_curve
 from twin.station.report.words import prefix_for
 from twin.station.validation.canvas import dress
 

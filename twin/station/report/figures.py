@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from twin.plant.errors import InputError
 from twin.plant.linear import Array
-from twin.station.report.page import Html, element
+from twin.station.report.page import Html, element, join
 
 POINTS_PER_INCH = 72
 WIDTH_IN = 10.0
@@ -107,6 +107,19 @@ def as_html(plot: Plot) -> Html:
     )
 
 
+def all_as_html(plots: list[Plot], progress: Callable[[int, int], None]) -> Html:
+    """Plots below each other; ``progress`` takes those drawn and all."""
+    drawn = []
+    for done, plot in enumerate(plots, start=1):
+        drawn.append(as_html(plot))
+        progress(done, len(plots))
+    return join(drawn)
+
+
+def no_progress(_done: int, _total: int) -> None:
+    """For who does not wait."""
+
+
 def save_plots(plots: list[Plot], path: Path) -> None:
     """Write plots into one file: a page each in a .pdf, below each other in a .png or .svg.
 
@@ -153,7 +166,6 @@ def _drawn(plot: Plot) -> Figure:
         figure = Figure(figsize=(WIDTH_IN, plot.height_in), dpi=POINTS_PER_INCH, layout="constrained")
         FigureCanvasAgg(figure)
         plot.draw(figure)
-        figure.draw_without_rendering()
     return figure
 
 

@@ -1,13 +1,15 @@
 """The page that is filed after a test."""
 
+from collections.abc import Callable
 from typing import Any
 
 from twin.station.report.document import alarms
-from twin.station.report.figures import HOVER, as_html
-from twin.station.report.page import Html, badge, element, facts, join, page, section, table, tiles
+from twin.station.report.figures import HOVER, all_as_html, no_progress
+from twin.station.report.page import Html, badge, element, join, page, section, table, tiles
 from twin.station.report.plots import plots_of
 from twin.station.report.replayed import Replayed
-from twin.station.report.words import quantity, seconds, share, size, some, span
+from twin.station.report.setup_page import setup_of
+from twin.station.report.words import quantity, seconds, share, some, span
 
 MARKS = {"kept": "good", "broken": "bad", "unknown": "open"}
 LEVELS = {"error": "bad", "warning": "warn", "info": "open"}
@@ -17,16 +19,20 @@ SECTIONS = (
 )  # fmt: skip
 
 
-def filed_page(run: Replayed, said: dict[str, Any]) -> str:
+def filed_page(
+    run: Replayed, said: dict[str, Any], progress: Callable[[int, int], None] = no_progress
+) -> str:
     """The whole page.
 
     Parameters
     ----------
     said
         `twin.station.report.document.document` of the run.
+    progress
+        Takes plots drawn and plots in all.
     """
     links = join(element("a", title, href=f"#{name}") for name, title in SECTIONS)
-    plots = join(as_html(plot) for plot in plots_of(run))
+    plots = all_as_html(plots_of(run), progress)
     body = join((
         element("h1", f"Test report: {run.name}"),
         element("p", _lead(said), class_="dim"),
@@ -35,7 +41,7 @@ def filed_page(run: Replayed, said: dict[str, Any]) -> str:
         element("nav", links, aria_label="Sections"),
         section("Limits", "limits", _limits(said)),
         section("Plots", "plots", plots, _prediction(said)),
-        section("Set-up", "setup", _setup(said)),
+        section("Set-up", "setup", setup_of(said)),
         section("Proposals", "proposals", _proposals(said)),
         section("Predicted and achieved", "audit-table", _audit(said)),
         section("Alarms and faults", "alarms", _alarms(run, said)),
@@ -123,111 +129,18 @@ def _limits(said: dict[str, Any]) -> Html:
 
 
 def _prediction(said: dict[str, Any]) -> Html:
-    rows = [
-        [s["sensor"], f"{s['nrmse']:.4f}", "–" if s["nrmse_without_input"] is None else f"{s['nrmse_without_input']:.4f}",
-         str(s["rows"])]
-        for s in said["figures"]["sensors"]
-    ]  # fmt: skip
+    rows = []
+    for s in said["figures"]["sensors"]:
+        without = s["nrmse_without_input"]
+        rows.append(
+            [s["sensor"], f"{s['nrmse']:.4f}", None if without is None else f"{without:.4f}", s["rows"]]
+        )
     if not rows:
         return Html("")
     words = "One-step prediction, rms(error)/std(signal), with the known input and without."
     heads = ("sensor", "NRMSE", "without the input", "rows")
     return join((element("h3", "Prediction", class_="sub"), element("p", words, class_="dim"),
                  table(heads, rows, (1, 2, 3))))  # fmt: skip
-
-
-def _setup(said: dict[str, Any]) -> Html:
-    s, v = said["setup"], said["verify"]
-    whole = {
-        True: badge("whole", "good"),
-        False: badge("not whole", "bad"),
-        None: badge("no checksums", "open"),
-    }[v["whole"]]
-    files = join(
-        join((f"{f['name']}, {size(f['bytes'])}, SHA-256 ", element("code", f["sha256"]), Html("<br>")))
-        for f in s["files"]
-    )
-    hz = s["excitation_hz"]
-    pairs: list[tuple[str, object]] = [
-        ("File", files),
-        (
-            "Verified",
-            join((whole, f" {v['blocks']} blocks read;" if v["blocks"] is not None else "", _masked(v))),
-        ),
-        ("Plant", join((f"{s['plant']}, fingerprint ", element("code", s["plant_fingerprint"])))),
-        ("Configuration", element("code", s["config_id"]) if s["config_id"] else "not recorded"),
-        ("Law at the start", _law(s["law"])),
-        (
-            "Excitation",
-            "none tracked"
-            if hz is None
-            else f"{span(hz[0], hz[1], 'Hz')}, by {s['excitation_tracked'] or 'the absorber'}",
-        ),
-        ("Channels", ", ".join(f"{c['name']} [{c['unit']}]" for c in s["channels"])),
-        ("Seed", "–" if s["seed"] is None else str(s["seed"])),
-        ("Recorded by", f"atmd-twin {s['program_version']}" if s["program_version"] else "another program"),
-        ("Versions", ", ".join(f"{k} {w}" for k, w in s["software"].items()) or "not recorded"),
-    ]
-    pairs += [("Remark", remark) for remark in s["remarks"]]
-    return join((facts(pairs), _parts(s)))
-
-
-def _masked(v: dict[str, Any]) -> str:
-    m = v["masked"]
-    text = f" {m['values']} values masked"
-    return text + (f" ({share(m['share'])} of all)" if m["values"] else "")
-
-
-def _law(law: dict[str, Any]) -> str:
-    if not law:
-        return "not recorded"
-    words = [law["feedback"]] if "feedback" in law else []
-    if "on_from_hz" in law:
-        words.append(
-            f"acting from {law['on_from_hz']:g} to {law['on_to_hz']:g} Hz, {law['table_points']} points"
-        )
-        for name, sign, unit in (
-            ("gamma_n_m", "γ", "N/m"), ("beta_ns_m", "β", "Ns/m"), ("alpha_kg", "α", "kg"),
-            ("low_pass_hz", "low-pass", "Hz"), ("high_pass_hz", "high-pass", "Hz"),
-        ):  # fmt: skip
-            words.append(f"{sign} {span(law[name][0], law[name][1], unit)}")
-    if "loop_delay_s" in law:
-        words.append(f"loop delay {quantity(law['loop_delay_s'], 's')}")
-    if "retuned" in law:
-        words.append("retuned as it ran" if law["retuned"] else "not retuned")
-    return "; ".join(words)
-
-
-def _parts(s: dict[str, Any]) -> Html:
-    def damping(value: object) -> str:
-        return f"{value:g} Ns/m" if isinstance(value, float) else "against frequency"
-
-    bodies = [
-        [
-            b["name"],
-            f"{b['mass_kg']:g} kg",
-            b["attached_to"],
-            f"{b['stiffness_n_m']:g} N/m",
-            damping(b["damping_ns_m"]),
-        ]
-        for b in s["bodies"]
-    ]
-    motors = []
-    for a in s["actuators"]:
-        about = {
-            k: v
-            for k, v in a.items()
-            if k not in ("name", "kind", "between", "on", "recorded_as") and v is not None
-        }
-        where = a["on"] or " and ".join(a["between"] or ())
-        motors.append(
-            [a["name"], a["kind"].replace("_", " "), where, ", ".join(f"{k} {v}" for k, v in about.items())]
-        )
-    return join((
-        element("h3", "Plant", class_="sub"),
-        table(("body", "mass", "attached to", "stiffness", "damping"), bodies, (1, 3, 4)),
-        table(("actuator", "kind", "on, between", "constants"), motors) if motors else "",
-    ))  # fmt: skip
 
 
 def _proposals(said: dict[str, Any]) -> Html:

@@ -11,7 +11,7 @@ STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 74rem; padding: 2rem 1.5rem 4rem; color: var(--text); background: #fff;
   font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
-h1 { font-size: 1.9rem; margin: 0 0 .3rem; } h2 { margin: 2.6rem 0 .8rem; font-size: 1.35rem; }
+h1 { font-size: 1.9rem; margin: 0 0 .3rem; overflow-wrap: anywhere; } h2 { margin: 2.6rem 0 .8rem; font-size: 1.35rem; }
 h3 { margin: 0; font-size: 1.05rem; } h3.sub { margin: 1.6rem 0 .5rem; }
 p { max-width: 52rem; } .dim, small { color: var(--dim); }
 :focus-visible { outline: 3px solid #1565c0; outline-offset: 2px; }
@@ -34,7 +34,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 code { font: .82rem ui-monospace, "SF Mono", Consolas, monospace; overflow-wrap: anywhere; }
 dl.facts { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.4rem; margin: 0; }
 dl.facts dt { color: var(--dim); } dl.facts dd { margin: 0; overflow-wrap: anywhere; }
-nav a { margin-right: 1.1rem; } a { color: #1565c0; }
+nav { display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; } a { color: #1565c0; }
 details > summary { cursor: pointer; padding: .3rem 0; }
 .plot { position: relative; } .plot output { position: absolute; pointer-events: none; background: #ffffffee;
   border: 1px solid #78909c; border-radius: .3rem; padding: .25rem .5rem; font-size: .78rem; line-height: 1.35;
