@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import rerun.blueprint as rrb
 
-from twin.plant.config import Plant
+from twin.plant.config import ForceActuator, Plant
 from twin.station import curve_plot
 from twin.station.columns import TIMELINE
 from twin.station.view import spectrum_plot
-from twin.station.view.schematic import ROOT as SCHEMATIC
+from twin.station.view.spectrum import BINS
+from twin.station.view.still import ROOT as SCHEMATIC
 
 WAVEFORM_S = 0.12
 _BACKGROUND = [13, 16, 17]
@@ -84,14 +85,14 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
         power = _trend("power", "Coil power against budget [W]", trend)
         left = rrb.Vertical(schematic, spectrum, words, row_shares=[5, 5, 3.4])
         middle = rrb.Vertical(vibration, power, health, row_shares=[5, 5, 3.4])
-        behind = rrb.Tabs(excitation, _gains(trend), active_tab=0)
+        behind = rrb.Tabs(*_estimates(layout, trend), excitation, _gains(trend), active_tab=0)
         right = rrb.Vertical(waves, _damping(trend), behind, row_shares=[5, 5, 3.4])
         body = rrb.Horizontal(left, middle, right, column_shares=[1, 1, 1])
     else:
         left = rrb.Vertical(schematic, spectrum, row_shares=[1, 1])
         right = rrb.Vertical(
             waves,
-            rrb.Horizontal(health, excitation) if layout.spectrum else health,
+            rrb.Horizontal(health, rrb.Tabs(*_estimates(layout, trend), excitation, active_tab=0)),
             words,
             row_shares=[5, 5, 3.4],
         )
@@ -110,13 +111,20 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 
 def _waveforms(layout: Layout) -> list[rrb.TimeSeriesView]:
-    views = [
+    return [
         _waveform(path, f"{name}: measured, twin" if k == 0 else name)
         for k, (path, name) in enumerate(layout.waveforms)
     ]
-    views.append(_waveform("estimate/primary", f"{layout.plant.primary.name} estimated [µm]"))
-    if layout.plant.absorber is not None:
-        views.append(_waveform("estimate/stroke", "stroke estimated [mm]"))
+
+
+def _estimates(layout: Layout, trend: rrb.VisibleTimeRange | None) -> list[rrb.TimeSeriesView]:
+    """What nothing measures, with one standard deviation to either side."""
+    plant = layout.plant
+    views = [_waveform("estimate/primary", f"{plant.primary.name} estimated ±1σ [µm]")]
+    if plant.absorber is not None:
+        views.append(_waveform("estimate/stroke", "Stroke ±1σ [mm]"))
+    if plant.voice_coil is not None and any(isinstance(a, ForceActuator) for a in plant.actuator):
+        views.append(_trend("estimate/force", "Unmeasured force ±1σ [N]", trend))
     return views
 
 
@@ -146,7 +154,7 @@ def _spectrum(name: str) -> rrb.Spatial2DView:
         name=f"Spectrum and waterfall over f [Hz]: {name}",
         background=_BACKGROUND,
         visual_bounds=rrb.VisualBounds2D(
-            x_range=[-26.0, p.BINS + 8.0], y_range=[-p.SPACE - p.HEIGHT - 8.0, p.ROWS + 3.0]
+            x_range=[-26.0, BINS + 8.0], y_range=[-p.SPACE - p.HEIGHT - 8.0, p.ROWS + 3.0]
         ),
     )
 

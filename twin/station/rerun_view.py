@@ -29,6 +29,9 @@ SHOWN_HZ = 1000.0
 _MICRO, _MILLI = 1e6, 1e3
 _BAND_95 = 1.96
 
+SHOWN_NIS = 10.0
+"""A larger one is drawn as this: what it was before the filter had settled would leave no room for the rest."""
+
 REPEAT_S = 60.0
 """What is said when it changes is said again so often, for a viewer that has come since and does not have it all."""
 
@@ -230,7 +233,7 @@ class RerunView:
             ("whiteness", estimate.innovation_lag1, -band, band),
         ):
             self._slow.add(f"health/{name}", end, np.array([[*values, low, high]]))
-        self._slow.add("health/nis", end, np.array([[estimate.nis, *frame.health.nis_band]]))
+        self._slow.add("health/nis", end, np.array([[min(estimate.nis, SHOWN_NIS), *frame.health.nis_band]]))
 
     def _show_performance(self, frame: Frame, end: Array) -> None:
         if frame.phasors is not None:

@@ -14,7 +14,7 @@ from twin.plant.linear import Array
 GAP = 44.0
 ROW = 40.0
 BODY_HEIGHT = 26.0
-MOTION_ROOM = 9.0
+MOTION_ROOM = 10.0
 """A body may be drawn this far from where it rests."""
 
 FILL = 1.1
@@ -169,6 +169,12 @@ def filled_box(width: float, height: float) -> list[Array]:
     return [np.array([[-reach, y], [reach, y]]) for y in levels]
 
 
+def outline(width: float, height: float) -> Array:
+    """Closed strip around a box about the origin."""
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
+    return np.asarray(corners * np.array([width, height]))
+
+
 def ground(height: float) -> list[Array]:
     """Strips of the ground at x = 0 from -height to height, hatched."""
     marks = np.arange(-height, height, 4.0)
@@ -180,4 +186,4 @@ def ground(height: float) -> list[Array]:
 
 def lowered(strip: Array, by: float) -> Array:
     """A strip moved down."""
-    return strip + np.array([0.0, by])
+    return np.asarray(strip + np.array([0.0, by]))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from twin.plant.blocks import Channel
-from twin.plant.config import MOTION_UNITS, Plant
+from twin.plant.config import Plant
 
 _OF_UNIT = {
     "m/s²": "acceleration", "m/s": "velocity", "m": "displacement", "A": "current", "V": "voltage", "N": "force",
@@ -20,19 +20,17 @@ class Group:
 
 
 def groups_of(plant: Plant, channels: tuple[Channel, ...]) -> list[Group]:
-    """Plots of waveforms: the primary body's motion by itself, everything else by unit."""
-    sensors = {s.name: s for s in plant.sensor}
-    motion = set(MOTION_UNITS.values())
+    """Plots of waveforms: the channel that tells most of the primary body by itself, everything else by unit."""
+    sensors = {s.name for s in plant.sensor}
+    first = spectrum_column(plant, channels)
     groups: dict[str, Group] = {}
-    for column, channel in enumerate(channels):
-        sensor = sensors.get(channel.name)
-        if sensor is not None and channel.unit in motion and sensor.of == plant.primary.name:
-            key = plant.primary.name
-        else:
-            key = _OF_UNIT.get(channel.unit, "other")
+    order = [] if first is None else [first]
+    for column in [*order, *(k for k in range(len(channels)) if k != first)]:
+        channel = channels[column]
+        key = plant.primary.name if column == first else _OF_UNIT.get(channel.unit, "other")
         group = groups.setdefault(key, Group(f"waveform/{key}"))
         group.channels.append(column)
-        if sensor is not None:
+        if channel.name in sensors:
             group.twin.append(channel.name)
     return list(groups.values())
 

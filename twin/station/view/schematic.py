@@ -43,7 +43,7 @@ class Schematic:
         self._strobe = Stroboscope()
         self._motion = FollowingScale(1e-9)
         self._loupe = FollowingScale(1e-9)
-        self._force = FollowingScale(1e-6)
+        self._force = {a.name: FollowingScale(1e-6) for a in plant.actuator}
         self._current = FollowingScale(1e-3)
         self._text_at_s = -np.inf
         self._marks_at: tuple[float, ...] = ()
@@ -100,21 +100,25 @@ class Schematic:
             )
 
     def _point(self, time_s: Array, rows: Array, drives: dict[str, Array | None]) -> None:
-        """Arrows of the forces on the bodies, and of the current in the coil."""
-        forces = {a.name: force_of(a, drives[a.name]) for a in self._plant.actuator}
-        known = [f for f in forces.values() if f is not None]
-        self._force.follow(max((float(np.nanmax(np.abs(f))) for f in known), default=0.0))
+        """Arrows of the forces on the bodies, every actuator's on its own scale, and of the current in the coil."""
+        lengths = {}
+        for actuator in self._plant.actuator:
+            force, scale = force_of(actuator, drives[actuator.name]), self._force[actuator.name]
+            if force is None:
+                lengths[actuator.name] = np.zeros(len(rows))
+                continue
+            scale.follow(_peak(force))
+            lengths[actuator.name] = ARROW / scale.full * force[rows]
         vectors = []
         for actuator, _, sign in pushes(self._plant):
-            f = forces[actuator.name]
-            shown = np.zeros(len(rows)) if f is None else sign * ARROW / self._force.full * f[rows]
+            shown = sign * lengths[actuator.name]
             vectors.append(np.column_stack([shown, np.zeros(len(rows))]))
         if vectors:
             self._columns.add_arrows(f"{ROOT}/force", time_s, np.nan_to_num(np.stack(vectors, axis=1)))
         voice_coil = self._plant.voice_coil
         current = None if voice_coil is None else drives[voice_coil.name]
         if current is not None:
-            self._current.follow(float(np.nanmax(np.abs(current))))
+            self._current.follow(_peak(current))
             up = -0.6 * ARROW / self._current.full * np.nan_to_num(current[rows])
             self._columns.add_arrows(f"{ROOT}/current", time_s, np.column_stack([0.0 * up, up])[:, None, :])
 
@@ -137,10 +141,10 @@ class Schematic:
             force = force_of(actuator, drive)
             if drive is None or force is None or not np.isfinite(force).any():
                 continue
-            newton = in_words(float(np.nanmax(np.abs(force))), "N")
+            newton = in_words(_peak(force), "N")
             if isinstance(actuator, VoiceCoil):
                 x, y = self._drawing.middle(actuator)
-                ampere = in_words(float(np.nanmax(np.abs(drive))), "A")
+                ampere = in_words(_peak(drive), "A")
                 say(x, y + 0.5 * BODY_HEIGHT + FIGURES_Y, f"{ampere}, {newton}", palette.COPPER)
             else:
                 say(0.5 * GAP, row, f"{name} {newton}", palette.FORCE)
@@ -148,7 +152,7 @@ class Schematic:
         if hz is not None:
             slower = slower_by(hz)
             say(
-                0.5 * GAP - 3.0, y + 3.0, f"{hz:.2f} Hz" + (f", {slower:.0f}× slower" if slower > 1.0 else "")
+                0.5 * GAP - 7.0, y + 3.0, f"{hz:.2f} Hz" + (f", {slower:.0f}× slower" if slower > 1.0 else "")
             )
         say(x, y + 3.0, f"{self._plant.primary.name}: ruler ±{in_words(self._loupe.full, 'm')}")
         say(self._drawing.bar[0], y + 3.0, f"bar {in_words(self._motion.full, 'm')}")
@@ -175,3 +179,8 @@ class Schematic:
             f"{ROOT}/loupe/marks",
             rr.LineStrips2D(strips, colors=palette.array(colours), radii=rr.Radius.ui_points(1.5)),
         )
+
+
+def _peak(values: Array) -> float:
+    """Largest size of any; 0 where there is none."""
+    return float(np.nanmax(np.abs(values), initial=0.0))

@@ -96,6 +96,18 @@ class Waterfall:
         self.levels = np.full((rows, lines), np.nan)
         self._used, self._row_ends_s = 0, -np.inf
 
+    @property
+    def length_s(self) -> float:
+        """Time that `image` spans [s]."""
+        return self.row_s * (max(self._used, 1) if self._whole else len(self.levels))
+
+    def image(self) -> Array:
+        """(rows, lines), newest first; a whole run fills all of them from its first spectrum on."""
+        if not self._whole:
+            return self.levels
+        rows = np.arange(len(self.levels)) * max(self._used, 1) // len(self.levels)
+        return self.levels[rows]
+
     def add(self, time_s: float, amplitudes: Array) -> None:
         """Take a spectrum."""
         if time_s < self._row_ends_s and self._used:

@@ -51,7 +51,7 @@ class SpectrumPlot:
         self._line_s, self._image_s, self._whole = line_s, image_s, whole
         self._line_at_s = self._image_at_s = -np.inf
         self._top: int | None = None
-        self._row_s = 0.0
+        self._length_s = 0.0
         self._x = np.arange(lines) + 0.5
 
     def add(self, end_s: float, values: Array, excitation_hz: float | None) -> None:
@@ -72,13 +72,13 @@ class SpectrumPlot:
         self._draw_lines(amplitudes, excitation_hz)
         if end_s >= self._image_at_s - 1e-9:
             # An image of the whole run changes the slower the more there is of it.
-            rows_s = 0.03 * ROWS * self._waterfall.row_s if self._whole else 0.0
+            rows_s = 0.03 * self._waterfall.length_s if self._whole else 0.0
             self._image_at_s = end_s + max(self._image_s, rows_s)
             self._draw_image()
 
     def repeat(self) -> None:
         """Draw scales and image again when next they can be, for a viewer that has come since."""
-        self._top, self._row_s, self._image_at_s = None, 0.0, -np.inf
+        self._top, self._length_s, self._image_at_s = None, 0.0, -np.inf
 
     def _level(self, amplitudes: Array) -> Array:
         """Share of the scale, 0 at its bottom and 1 at its top."""
@@ -103,8 +103,8 @@ class SpectrumPlot:
         self._stream.log(f"{ROOT}/lines", lines)
 
     def _draw_image(self) -> None:
-        image = np.round(255.0 * self._level(self._waterfall.levels))
-        image[np.isnan(self._waterfall.levels)] = 0.0
+        levels = self._waterfall.image()
+        image = np.where(np.isnan(levels), 0.0, np.round(255.0 * self._level(levels)))
         self._stream.log(
             f"{ROOT}/waterfall",
             rr.DepthImage(
@@ -112,9 +112,9 @@ class SpectrumPlot:
                 magnification_filter="nearest", draw_order=-10.0,
             ),
         )  # fmt: skip
-        if self._waterfall.row_s != self._row_s:
-            self._row_s = self._waterfall.row_s
-            self._draw_time_axis()
+        if self._waterfall.length_s != self._length_s:
+            self._length_s = self._waterfall.length_s
+            self._draw_time_axis(self._length_s)
 
     def _draw_level_axis(self, top: int) -> None:
         spectrum = self._spectrum
@@ -136,11 +136,10 @@ class SpectrumPlot:
         labels = [f"{f:g}" for f in hz] + [_power_of_ten(top - DECADES + d) for d in decades[1:]]
         self._stream.log(f"{ROOT}/labels", _labels(places, labels))
 
-    def _draw_time_axis(self) -> None:
-        length_s = ROWS * self._waterfall.row_s
+    def _draw_time_axis(self, length_s: float) -> None:
         ago = np.arange(1, 4) * tick_step(length_s, 3)
-        ago = ago[ago < length_s]
-        y = np.concatenate([[1.0], ago / self._waterfall.row_s])
+        ago = ago[ago < 0.97 * length_s]
+        y = np.concatenate([[1.0], ago / length_s * ROWS])
         labels = ["now", *(f"−{t:g} s" for t in ago)]
         self._stream.log(f"{ROOT}/ago", _labels(np.column_stack([np.full(len(y), -11.0), y]), labels))
 

@@ -22,6 +22,7 @@ from twin.station.view.drawing import (
     filled_box,
     ground,
     lowered,
+    outline,
     spring,
 )
 from twin.station.view.forces import pushes
@@ -62,6 +63,7 @@ class StillParts:
         colour = palette.BODY if body is not self._plant.primary else palette.PRIMARY
         box = filled_box(place.width, place.height)
         self._strips(f"body/{body.name}/mass", box, colour, FILL, order=-5.0)
+        self._strips(f"body/{body.name}/edge", [outline(place.width, place.height)], colour, ui=1.8)
 
     def _draw_link(self, body: Body) -> None:
         """Spring, dashpot and what else acts between a body and the one that carries it."""

@@ -25,6 +25,7 @@ class Stroboscope:
     """Instants to look at, one block after the other."""
 
     _next_s: float = -np.inf
+    _end_s: float = -np.inf
 
     def flashes(self, begin_s: float, end_s: float, excitation_hz: float | None) -> Array:
         """Instants [s] within ``begin_s <= t < end_s``, going on from the block before.
@@ -35,11 +36,12 @@ class Stroboscope:
             How fast it shakes; None where that is not known.
         """
         period = flash_period_s(excitation_hz)
-        if not begin_s - period <= self._next_s < end_s:
+        if abs(begin_s - self._end_s) > 1e-6 or self._next_s > begin_s + period:
             self._next_s = begin_s
-        first = max(self._next_s, begin_s)
-        found = np.arange(first, end_s - 1e-12, period)
-        self._next_s = float(found[-1]) + period if len(found) else first
+        self._end_s = end_s
+        found = np.arange(max(self._next_s, begin_s), end_s - 1e-12, period)
+        if len(found):
+            self._next_s = float(found[-1]) + period
         return found
 
 

@@ -90,7 +90,7 @@ def _health(stream: rr.RecordingStream, plant: Plant, units: dict[str, str]) -> 
     _lines(
         stream,
         "health/nis",
-        ["NIS [1]", "95 % from", "95 % to"],
+        ["NIS [1], cut at 10", "95 % from", "95 % to"],
         [palette.IN_USE, palette.GOOD, palette.GOOD],
         [2.0, 2.0, 2.0],
     )
