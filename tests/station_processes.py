@@ -36,6 +36,13 @@ def wait_for(log: Path, pattern: str, process: subprocess.Popen[bytes], within_s
     raise AssertionError(f"'{pattern}' never came: {log.read_text()}")
 
 
+def atmd(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    """Run a command to its end."""
+    return subprocess.run(
+        [ATMD, *arguments], capture_output=True, text=True, check=False, env=os.environ | {"COLUMNS": "200"}
+    )
+
+
 class Station:
     """``atmd rig`` and ``atmd live`` side by side in a folder."""
 
@@ -65,14 +72,15 @@ class Station:
         )  # fmt: skip
         wait_for(self.folder / "rig.log", "samples on", self.rig)
 
-    def start_live(self, *more: str) -> None:
+    def start_live(self, *more: str, connected: bool = True) -> None:
+        """Start the station; ``connected`` False does not wait until it has heard of the rig."""
         self.live = self._start(
             "live", "live", f"tcp://127.0.0.1:{self.port}", "--plant", "rig",
             "--keys", self.folder / "station.key_secret", "--rig", self.folder / "rig.key",
             "--save", self.folder / "live.rrd", *more,
         )  # fmt: skip
-        wait_for(self.folder / "live.log", "connected: ", self.live)
-        if "--no-web" not in more:
+        wait_for(self.folder / "live.log", "connected: " if connected else "waiting for", self.live)
+        if "--no-web" not in more and connected:
             self.url = wait_for(self.folder / "live.log", r"page: (\S+)", self.live)
 
     def end_live(self) -> str:
