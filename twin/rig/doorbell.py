@@ -77,7 +77,7 @@ class Doorbell:
                 )
             case zmq.Event.HANDSHAKE_FAILED_NO_DETAIL:
                 return Trouble(
-                    f"what answers at {self._address} has another key than the one given as the rig's (--rig)",
+                    f"what answers at {self._address} is no rig, or has another key than the one given (--rig)",
                     True,
                 )
             case zmq.Event.HANDSHAKE_FAILED_PROTOCOL:

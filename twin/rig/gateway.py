@@ -524,9 +524,8 @@ class RigGateway:
         arrived_s, counts = time.monotonic(), run.arrivals.counts
         received, stray = counts.received, counts.stray
         for due in run.arrivals.take(block, header.sequence):
-            if due is block:
-                self._last_arrival_s = arrived_s
-                self._rig_notice = plain(header.notice, 500)
+            # What is handed on says that this one is believed.
+            self._last_arrival_s, self._rig_notice = arrived_s, plain(header.notice, 500)
             yield due
         if counts.received == received + 1:  # in its turn: others waited for somebody
             end = header.first_sample + header.n_samples

@@ -27,7 +27,6 @@ from tuning.whatif import CurvePoint, Curves, WhatIf
 from twin.control.schedule import Gains, GainSchedule
 from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
-from twin.station.whatif_source import proposed_schedule
 
 ANSWER_TIMEOUT_S = 60.0
 LONGEST_STEP = 0.5
@@ -256,6 +255,9 @@ class _Worker:
         return WhatIfProposal(base, Curves(tuple(points), goal, base.amplitude), _steps(base, meant), goal)
 
     def _branches(self, asked: Asked) -> list[Any]:
+        # Brings readers of all recordings with it: fifty megabytes that nobody needs before the first branch.
+        from twin.station.whatif_source import proposed_schedule
+
         base, instant = asked.base, asked.instant
         if instant is None:
             raise InputError("a branch needs an instant")
