@@ -79,7 +79,7 @@ class Watcher(threading.Thread):
         super().__init__(name="watcher", daemon=True)
         self._place = urlsplit(url)
         self.state: dict[str, Any] = {}
-        self.states = self.questions = self.rows = 0
+        self.states = self.questions = self.rows = self.switched_on = 0
         self.error = ""
         self.over = threading.Event()
 
@@ -113,13 +113,21 @@ class Watcher(threading.Thread):
                 self.error = f"{type(error).__name__}: {error}"
 
     def _ask(self, port: int, cookie: str) -> None:
+        """One what-if question; and control on, if it is off: that is the operator's to order."""
         self.questions += 1
+        asked = {"changes": {"budget_w": 0.2 + 0.1 * (self.questions % 40)}}
+        self._post(port, cookie, "/api/whatif", asked)
+        if self.state["control_on"] is False and 45.5 < (self.state["excitation_hz"] or 0.0) < 54.5:
+            self.switched_on += 1
+            self._post(port, cookie, "/api/on", {"seen_sample": self.state["sample"]})
+
+    @staticmethod
+    def _post(port: int, cookie: str, path: str, body: dict[str, Any]) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60.0)
-        body = json.dumps({"changes": {"budget_w": 0.2 + 0.1 * (self.questions % 40)}})
         headers = {"Cookie": cookie, "Origin": f"http://127.0.0.1:{port}", "Content-Type": "application/json"}
-        connection.request("POST", "/api/whatif", body, headers)
-        connection.getresponse().read()
-        connection.close()
+        with contextlib.closing(connection):
+            connection.request("POST", path, json.dumps(body), headers)
+            connection.getresponse().read()
 
 
 @dataclass(slots=True)
@@ -241,6 +249,7 @@ def _soak(setting: Setting, folder: Path) -> Report:
         "states_seen_by_page": watcher.states,
         "log_rows_seen_by_page": watcher.rows,
         "what_if_questions": watcher.questions,
+        "control_switched_on": watcher.switched_on,
         "watcher_error": watcher.error,
         "exit_code": code,
         "rig_alive_at_end": rig_alive,
