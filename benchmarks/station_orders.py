@@ -21,7 +21,7 @@ from twin.rig.keys import load_pair, load_public
 from twin.rig.messages import SamplesHeader
 from twin.rig.wire import TOPIC_SAMPLES, guard_client
 
-GIVEN_UP_S = 5.0
+GIVEN_UP_S, START_S = 5.0, 60.0
 SAMPLE_RATE_HZ = 50_000.0
 BUDGETS_W = (1.0, 2.0, 0.5, 3.0)
 
@@ -31,6 +31,7 @@ def order_latencies(both: Station, count: int) -> dict[str, list[float]]:
     out: dict[str, list[float]] = {"send": [], "revert": [], "off": [], "on": []}
     rng = random.Random(3)  # noqa: S311 - moments to press a button, no secret
     operator = _Operator(both.url)
+    operator.wait_until_followed()
     with closing(_Blocks(both)) as blocks:
         blocks.start()
         for k in range(count):
@@ -122,6 +123,14 @@ class _Operator:
     def state(self) -> dict[str, Any]:
         """What the page shows."""
         return self._ask("GET", "/api/state", None)
+
+    def wait_until_followed(self) -> None:
+        """Until the twin follows a rig with a controller and an excitation."""
+        end = time.monotonic() + START_S
+        while not self.state()["what_if"]:
+            if time.monotonic() > end:
+                raise RuntimeError(f"the twin follows no rig within {START_S:.0f} s")
+            time.sleep(0.1)
 
     def post(self, path: str, **body: Any) -> dict[str, Any]:
         """Answer to a call of the page."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 from tests.test_cli import atmd
 from tuning.branch import Brancher, _over
 from tuning.changes import KEYS, Changes, parse_changes
+from tuning.design import Design, Start
 from tuning.retune import Retuner, TuningGoal
+from tuning.search import Found
 from tuning.stability import StabilityWatch
+from tuning.verify import Demands, Situation
 from tuning.whatif import Curves, WhatIf
 from twin.plant.blocks import make_block
 from twin.plant.errors import InputError
@@ -22,6 +26,7 @@ from twin.station.frame import Frame
 from twin.station.given_gains import split_given
 from twin.station.instant import instant_at
 from twin.station.whatif import WhatIfOptions, coil_of, run_whatif
+from twin.station.whatif_process import Asked, Base, _SupersededError, _Worker, coarse_to_fine
 from twin.station.whatif_source import from_recording
 
 TEST_1, TEST_3 = programme("test1"), programme("test3")
@@ -78,6 +83,125 @@ def test_a_tight_budget_is_kept_moves_the_proposal_and_leaves_the_gains_in_use(
         assert after.proposed.powers is not None
         assert after.proposed.powers.joule_mean_w <= 0.2 * 1.001
     assert sum(moved(tight)) > 1.5 * sum(moved(as_is))
+
+
+SLIDES = [Changes(budget_w=4.0 * 0.8**k) for k in range(1, 11)] + [
+    Changes(budget_w=0.5, modulus_margin=0.15 + 0.04 * k) for k in range(6)
+]
+
+
+@pytest.fixture(scope="module")
+def followed() -> tuple[WhatIf, list[tuple[Changes, Curves]]]:
+    """A slider followed: quick answers only, as a person moves budget and margin without a pause."""
+    what_if = WhatIf(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+    what_if.curves(BAND)
+    return what_if, [(changes, what_if.curves(BAND, changes, quick=True)) for changes in SLIDES]
+
+
+def test_all_that_a_followed_slider_shows_is_verified(
+    followed: tuple[WhatIf, list[tuple[Changes, Curves]]],
+) -> None:
+    shown = 0
+    for changes, curves in followed[1]:
+        for p in curves.points:
+            assert p.provisional
+            if p.proposed is None:
+                assert p.reason
+                continue
+            assert p.proposed.gains is not None
+            situation = Situation(TEST_3.true_plant, FACTS, p.frequency_hz, 4.0, 0.05, GOAL.drift_hz)
+            assert situation.decay_rate_1_s(p.proposed.gains) < -GOAL.slowest_decay_1_s * 0.999
+            assert situation.margins(p.proposed.gains).modulus >= changes.goal(GOAL).modulus_margin * 0.999
+            found = situation.predictions(p.proposed.gains)
+            assert max(q.powers.joule_mean_w for q in found) <= changes.goal(GOAL).budget_w * 1.001
+            assert found[0].displacement_m == pytest.approx(p.proposed.displacement_m, rel=1e-9)
+            assert (p.limit_m or 0.0) <= found[0].displacement_m * (1.0 + 1e-6) + 1e-12
+            shown += 1
+    assert shown > 0.9 * len(SLIDES) * len(BAND)
+
+
+def test_whole_search_confirms_what_a_followed_slider_showed_and_is_not_coloured_by_it(
+    followed: tuple[WhatIf, list[tuple[Changes, Curves]]],
+) -> None:
+    what_if, shown = followed
+    fresh = WhatIf(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+    off = []
+    for changes, quick in shown[::3]:
+        whole = what_if.curves(BAND, changes)
+        assert whole == fresh.curves(BAND, changes)  # to the bit
+        assert not any(p.provisional for p in whole.points)
+        for a, b in zip(quick.points, whole.points, strict=True):
+            if a.proposed is not None and b.proposed is not None:
+                off.append(
+                    abs((a.proposed.displacement_m or 0.0) - (b.proposed.displacement_m or 0.0)) / b.passive_m
+                )
+        assert what_if.curves(BAND, changes, quick=True) == whole  # once known it is not asked for again
+    assert np.quantile(off, 0.8) < 2e-3
+
+
+def test_gains_that_a_changed_limit_does_not_bind_are_not_sought_again() -> None:
+    situation = Situation(TEST_3.true_plant, FACTS, 49.0, 4.0, 0.05, GOAL.drift_hz)
+    demands = Retuner(TEST_3.true_plant, FACTS, GOAL).demands
+    found = Found(np.zeros(3), 0.1, 0.0, "modulus margin", {"modulus margin": 0.2}, 3)
+    design = Design(TEST_3.schedule.at(49.0), (), found, situation.design_grid)
+    start = Start(found.numbers, design, demands)
+
+    def asked(**goal: object) -> Demands:
+        return Retuner(TEST_3.true_plant, FACTS, TuningGoal(**goal)).demands  # type: ignore[arg-type]
+
+    assert start.still_holds(asked(budget_w=0.3))
+    assert not start.still_holds(asked(modulus_margin=0.2))
+    assert not start.still_holds(asked(displacement_m=1e-5))
+    assert not Start(found.numbers).still_holds(demands)
+
+
+def test_another_size_of_excitation_changes_nothing_but_the_sizes() -> None:
+    gains = TEST_3.schedule.at(52.0)
+    small, large = (Situation(TEST_3.true_plant, FACTS, 52.0, a, 0.05, 0.25) for a in (1.5, 4.0))
+    for a, b in zip(large.scaled(1.5).predictions(gains), small.predictions(gains), strict=True):
+        assert a.displacement_m == pytest.approx(b.displacement_m, rel=1e-12)
+        assert a.powers.electrical_mean_w == pytest.approx(b.powers.electrical_mean_w, rel=1e-12)
+        assert a.voltage_peak_v == pytest.approx(b.voltage_peak_v, rel=1e-12)
+    assert large.amplitude == 4.0
+
+
+def test_a_search_that_is_stopped_loses_nothing_of_what_was_found() -> None:
+    what_if = WhatIf(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+    calls = 0
+
+    def go_on() -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 2:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        what_if.curves(BAND, Changes(budget_w=1.0), go_on=go_on)
+    fresh = WhatIf(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+    assert what_if.curves(BAND, Changes(budget_w=1.0)) == fresh.curves(BAND, Changes(budget_w=1.0))
+
+
+def test_page_gets_all_curves_at_once_then_each_point_confirmed_until_a_newer_question_comes() -> None:
+    base = Base(TEST_3.true_plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05)
+    asked = Asked("curves", base, Changes(budget_w=0.7), tuple(BAND))
+    ours, theirs = multiprocessing.Pipe()
+    worker = _Worker(theirs)
+    first, *rest = worker.answer(asked)
+    assert [p.proposed is not None for p in first.points] == [True] * len(BAND)
+    assert sorted(k for k, _ in rest) == list(range(len(BAND)))
+    assert not any(p.provisional for _, p in rest)
+    ours.send("a newer question")
+    parts = worker.answer(Asked("curves", base, Changes(budget_w=0.6), tuple(BAND)))
+    assert len(next(parts).points) == len(BAND)
+    with pytest.raises(_SupersededError):
+        next(parts)
+
+
+def test_coarse_to_fine_is_every_point_once_and_both_ends_first() -> None:
+    for n in (1, 2, 5, 11, 16):
+        order = coarse_to_fine(n)
+        assert sorted(order) == list(range(n))
+        assert order[: min(n, 2)] == [0, n - 1][: min(n, 2)]
 
 
 def test_peak_budget_is_half_the_mean_one(what_if: WhatIf) -> None:

@@ -38,9 +38,9 @@ function decades(values, shown) {
 }
 function upward(values, shown) {
   const high = 1.04 * Math.max(...values.filter((v) => v > 0), 1e-6);
-  if (shown && shown[1] >= high && shown[1] <= 4 * high) return shown;
+  if (shown && shown[1] >= high && shown[1] <= 5 * high) return shown;
   const decade = 10 ** Math.floor(Math.log10(high));
-  return [0, decade * [1, 1.5, 2, 3, 5, 7, 10].find((step) => step * decade >= high)];
+  return [0, decade * [1, 2, 5, 10].find((step) => step * decade >= high)];
 }
 
 // Plotly lays a chart out anew only where its axes change; else it moves the lines, which takes a twentieth of the time.

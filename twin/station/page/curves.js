@@ -81,14 +81,14 @@ function tell(what, moved) {
   document.dispatchEvent(new CustomEvent(`curves-${what}`, { detail: performance.now() - moved }));
 }
 
-// After the frame with what was drawn has been handed to the screen.
+// After the frame with what was drawn has been painted: a message is delivered behind it.
 function painted() {
   return new Promise((done) => {
     const shown = new MessageChannel();
     shown.port1.onmessage = () => done();
     const frame = () => shown.port2.postMessage(0);
     if (document.hidden) frame(); // nothing is painted, nothing calls back
-    else requestAnimationFrame(() => requestAnimationFrame(frame));
+    else requestAnimationFrame(frame);
   });
 }
 
