@@ -15,6 +15,7 @@ from twin.rig.foreign import open_foreign
 from twin.rig.programme import rig_channels
 from twin.rig.recorded import open_recording
 from twin.rig.recording import Recorder
+from twin.rig.storage import Storage
 from twin.rig.writers import WRITERS
 from twin.station.cli import app
 
@@ -105,6 +106,45 @@ def test_recording_that_was_cut_short_is_found_and_repaired_to_its_last_whole_bl
         np.testing.assert_array_equal(saved.values, block(saved.first_sample // BLOCK).values)
     done = RUN.invoke(app, ["recordings", "repair", str(cut), "--out", str(out)])
     assert isinstance(done.exception, InputError)
+
+
+def test_damaged_block_is_left_out_by_repair_and_nothing_half_is_exported(
+    recording: Path, tmp_path: Path
+) -> None:
+    content = bytearray(recording.read_bytes())
+    at = content.index(block(3).values.astype("<f4").tobytes()[:64])
+    content[at + 5] ^= 0x40
+    recording.write_bytes(content)
+    (row,) = json.loads(run("verify", recording, "--json", "-", code=1))["files"]
+    assert "sample 1500 (0.300 s) is damaged" in row["damage"][0]
+    out = tmp_path / "half.npz"
+    done = RUN.invoke(app, ["recordings", "export", str(recording), "--out", str(out)])
+    assert "atmd recordings repair" in str(done.exception)
+    assert not out.exists()
+    assert not out.with_suffix(".toml").exists()
+    run("repair", recording, "--out", tmp_path / "whole.rrd")
+    (row,) = json.loads(run("verify", tmp_path / "whole.rrd", "--json", "-"))["files"]
+    assert row["whole"]
+    assert row["gaps"] == [[3 * BLOCK, BLOCK], [5 * BLOCK, BLOCK]]
+    assert len(json.loads(run("show", tmp_path / "whole.rrd", "--json", "-"))["events"]) == 1
+
+
+def test_a_run_in_several_files_is_listed_once_and_repaired_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Recorder(
+        path, plant=PLANT, sample_rate_hz=FS, channels=CHANNELS, run_config_json="{}", seed=7,
+        storage=Storage(rotate_s=0.25, keep_free_bytes=0),
+    ) as recorder:  # fmt: skip
+        for k in range(BLOCKS):
+            recorder.write_block(block(k))
+    (row,) = json.loads(run("list", tmp_path, "--json", "-"))["recordings"]
+    files = list(tmp_path.glob("*.rrd"))
+    assert row["remark"] == f"in {len(files)} files"
+    assert row["bytes"] == sum(f.stat().st_size for f in files)
+    run("repair", path, "--out", tmp_path / "copy.rrd")
+    again = open_recording(tmp_path / "copy.rrd")
+    assert len(again.parts) == len(files) > 1
+    assert again.n_blocks == BLOCKS
 
 
 @pytest.mark.parametrize("ending", WRITERS)

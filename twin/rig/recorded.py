@@ -18,7 +18,7 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.rig.recording import ACKNOWLEDGEMENTS, COMMANDS, FORMAT_VERSION, PROPERTY, ROOT
 from twin.rig.regroup import Mark
-from twin.rig.rrf import extent, rows
+from twin.rig.rrf import Rows, extent, rows
 from twin.rig.storage import part_of, parts_beside
 
 HELD_BYTES = 256_000_000
@@ -125,10 +125,10 @@ class Recording:
 
     def _blocks_in_file(self, from_sample: int) -> Iterator[Block]:
         for batch in self._batches():
-            cells = batch.column("block")
+            cells, times = batch.column("block"), batch.column("time").cast(pa.int64()).to_pylist()
             for row, sample in enumerate(batch.column("sample").to_pylist()):
                 if sample >= from_sample:
-                    yield self._block(sample, cells[row].as_py()[0])
+                    yield self._block(sample, times[row], cells[row].as_py()[0])
 
     def _batches(self) -> Iterator[pa.RecordBatch]:
         if self._held is not None:
@@ -139,11 +139,12 @@ class Recording:
                 if found.batch is not None and found.entity == f"/{ROOT}/raw":
                     yield found.batch
 
-    def _block(self, first_sample: int, row: dict[str, Any]) -> Block:
-        if zlib.crc32(row["invalid"], zlib.crc32(row["samples"])) != row["crc32"]:
+    def _block(self, first_sample: int, time_ns: int, row: dict[str, Any]) -> Block:
+        if not _is_whole(first_sample, time_ns, row, self.sample_rate_hz, len(self.channels)):
             raise InputError(
                 f"{self.path}: the block at sample {first_sample} "
-                f"({first_sample / self.sample_rate_hz:.3f} s) is damaged; use another copy of the file"
+                f"({first_sample / self.sample_rate_hz:.3f} s) is damaged; use another copy of the file, or leave the "
+                "block out with 'atmd recordings repair'"
             )
         shape = (row["n_samples"], len(self.channels))
         values = np.frombuffer(row["samples"], row["dtype"]).astype(np.float64).reshape(shape)
@@ -238,6 +239,28 @@ def _joined(parts: list[Recording], missing: tuple[int, ...]) -> Recording:
         _notes={kind: sorted(rows, key=lambda row: row[0]) for kind, rows in notes.items()},
         _marks=tuple(marks),
         _held=None if None in held else tuple(batch for some in held if some is not None for batch in some),
+    )
+
+
+def blocks_are_whole(recording: Recording, found: Rows) -> bool:
+    """Whether rows of a recording's file hold no block that is not what was recorded."""
+    batch = found.batch
+    if batch is None or found.entity != f"/{ROOT}/raw":
+        return batch is not None
+    firsts, times = (batch.column(name).cast(pa.int64()).to_pylist() for name in ("sample", "time"))
+    return all(
+        _is_whole(first, time_ns, cell.as_py()[0], recording.sample_rate_hz, len(recording.channels))
+        for first, time_ns, cell in zip(firsts, times, batch.column("block"), strict=True)
+    )
+
+
+def _is_whole(first: int, time_ns: int, row: dict[str, Any], rate_hz: float, n_channels: int) -> bool:
+    """Whether a block's checksum is right, it is as long as it says, and stands where it belongs."""
+    n_bytes = {"<f4": 4, "<f8": 8}.get(row["dtype"], 0) * row["n_samples"] * n_channels
+    return (
+        zlib.crc32(row["invalid"], zlib.crc32(row["samples"])) == row["crc32"]
+        and len(row["samples"]) == n_bytes
+        and time_ns == round(first / rate_hz * 1e9)  # two records of the same
     )
 
 

@@ -9,7 +9,7 @@ Rerun's own reader, which ends the process, whatever it was doing, at some damag
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,14 +102,24 @@ def rows(path: Path) -> Iterator[Rows]:
         yield from found
 
 
-def copy_sound_part(path: Path, to: Path) -> None:
-    """Copy a file without its damaged messages and without what follows its last whole one."""
+def copy_sound_part(path: Path, to: Path, sound: Callable[[Rows], bool] = lambda _: True) -> int:
+    """Copy a file without its damaged messages and without what follows its last whole one; how many are left out.
+
+    Parameters
+    ----------
+    sound
+        Whether the rows of a message, which can be read, are also what they should be.
+    """
+    left_out = 0
     with path.open("rb") as file, to.open("wb") as copy:
         copy.write(file.read(_HEADER_BYTES))
         for at, length, found in _messages(path):
-            if all(one.batch is not None for one in found):
+            if all(one.batch is not None and sound(one) for one in found):
                 file.seek(at)
                 copy.write(file.read(length))
+            else:
+                left_out += 1
+    return left_out
 
 
 def _messages(path: Path) -> Iterator[tuple[int, int, list[Rows]]]:

@@ -193,10 +193,16 @@ def write_series(path: Path, series: Series) -> None:
         raise InputError(f"{path}: is there already; choose another name or remove it first")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.absolute().parent}; make it first")
+    sidecar = path.with_suffix(".toml")
+    had_sidecar = sidecar.exists()
     try:
         writer(path, series)
-    except OSError as error:
+    except BaseException as error:  # half a file would be taken for a whole one
         path.unlink(missing_ok=True)
+        if not had_sidecar:
+            sidecar.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise RunError(
             f"{path}: cannot be written ({error.strerror or error}); make room or write elsewhere"
         ) from error

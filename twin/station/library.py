@@ -3,10 +3,12 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from twin.plant.blocks import Block
@@ -33,6 +35,8 @@ class Inspection:
 
     Attributes
     ----------
+    blocks
+        Blocks in the recording.
     good_blocks
         Blocks whose checksum is right, from the beginning to the first damage.
     gaps
@@ -43,6 +47,7 @@ class Inspection:
         What is wrong, one sentence each; empty for a whole recording.
     """
 
+    blocks: int
     good_blocks: int
     gaps: tuple[tuple[int, int], ...]
     masked: int
@@ -55,11 +60,18 @@ def list_recordings(
     json_to: JsonOption = None,
 ) -> None:
     """List the recordings in a folder, newest first, those that cannot be read with the reason."""
+    from twin.rig.storage import parts_beside
+
     must_be_writable(json_to)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give the one with the recordings")
-    files = sorted(folder.rglob("*.rrd"), key=lambda p: p.stat().st_mtime, reverse=True)
-    rows = [_line(path) for path in files]
+    files = [path for path in folder.rglob("*.rrd") if path == min(parts_beside(path).items())[1]]
+    files.sort(key=lambda p: p.stat().st_mtime, reverse=True)
+    rows = []
+    with progress_bar("list") as progress:
+        for done, path in enumerate(files, start=1):
+            rows.append(_line(path))
+            progress(done, len(files))
 
     def table(_: dict[str, Any]) -> Table:
         out = Table("recording", "plant", "length", "size", "commands", "remark", title=str(folder))
@@ -112,7 +124,7 @@ def show(file: FileArgument, json_to: JsonOption = None) -> None:
             "",
             f"{r['seconds']:.1f} s, {r['blocks']} blocks at {rate:g} samples/s; made by {r['program_version']}",
         )
-        out.add_row("", ", ".join(f"{c.name} [{c.unit}]" for c in recording.channels))
+        out.add_row("", escape(", ".join(f"{c.name} [{c.unit}]" for c in recording.channels)))
         lines = [(n["sample"], f"{n['level']}: {n['text']}") for n in notes["events"] if "text" in n]
         lines += [(n["sample"], f"command {n['command_id']} due") for n in notes["commands"]]
         lines += [
@@ -123,7 +135,7 @@ def show(file: FileArgument, json_to: JsonOption = None) -> None:
             for n in notes["acknowledgements"]
         ]
         for sample, line in sorted(lines):
-            out.add_row(f"{sample / rate:.2f} s", line)
+            out.add_row(f"{sample / rate:.2f} s", escape(line))
         return out
 
     report(result, table, json_to)
@@ -144,9 +156,8 @@ def verify(
     must_be_writable(json_to)
     rows = []
     with progress_bar("verify") as progress:
-        for done, file in enumerate(files, start=1):
-            rows.append(_verified(file))
-            progress(done, len(files))
+        for done, file in enumerate(files):
+            rows.append(_verified(file, partial(_share, progress, done, len(files))))
 
     def table(_: dict[str, Any]) -> Table:
         out = Table("recording", "whole", "blocks", "masked", "remark")
@@ -170,20 +181,32 @@ def repair(
     file: FileArgument,
     out: Annotated[Path, typer.Option("--out", metavar="FILE.rrd", help="Where to write what is whole.")],
 ) -> None:
-    """Copy all that is whole of a recording that was cut short to a new file; the old one stays as it is."""
-    from twin.rig.recorded import open_recording
-    from twin.rig.rrf import copy_sound_part
+    """Copy all that is whole of a recording to a new file, or to as many as it has; the old ones stay as they are.
 
-    if out.exists():
-        raise InputError(f"{out}: is there already; choose another name or remove it first")
+    What is left out: what follows the last whole row of a file that was cut short, and pieces that are damaged.
+    """
+    from twin.rig.recorded import blocks_are_whole, open_recording
+    from twin.rig.rrf import copy_sound_part
+    from twin.rig.storage import part_of, part_path
+
     if not out.absolute().parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.absolute().parent}; make it first")
     recording = open_recording(file)
-    copy_sound_part(file, out)
-    found = inspect(out)
+    copies = [part_path(out, part_of(part)[1]) for part in recording.parts]
+    for copy in (out, *copies):
+        if copy.exists():
+            raise InputError(f"{copy}: is there already; choose another name or remove it first")
+    left_out = 0
+    with progress_bar("repair") as progress:
+        for done, (part, copy) in enumerate(zip(recording.parts, copies, strict=True)):
+            left_out += copy_sound_part(part, copy, partial(blocks_are_whole, recording))
+            progress(done + 1, len(copies))
+    found = inspect(copies[0])
     say(f"{out}: {found.good_blocks} blocks, {recording.end_sample / recording.sample_rate_hz:.1f} s")
-    if not recording.repaired:
-        say(f"{file} was not cut short")
+    if left_out:
+        say(f"{left_out} damaged pieces of {file} are left out")
+    elif not recording.repaired:
+        say(f"{file} was neither cut short nor damaged")
     for sentence in found.damage:
         say(sentence)
     if found.damage:
@@ -249,8 +272,8 @@ def smooth(
     say(f"{out}: {', '.join(c.name for c in channels[::2])} with standard deviations, {rate:g} samples/s")
 
 
-def inspect(file: Path) -> Inspection:
-    """Look at every block of a recording.
+def inspect(file: Path, progress: Callable[[int, int], None] = lambda _done, _total: None) -> Inspection:
+    """Look at every block of a recording; ``progress`` takes blocks done and blocks in all.
 
     Raises
     ------
@@ -269,28 +292,31 @@ def inspect(file: Path) -> Inspection:
     try:
         for block in recording.blocks():
             good += 1
+            progress(good, recording.n_blocks)
             masked += block.valid.size - int(block.valid.sum())
             if following is not None and block.first_sample > following:
                 gaps.append((following, block.first_sample - following))
             following = block.end_sample
     except InputError as error:
         damage.append(str(error).removeprefix(f"{file}: "))
-    return Inspection(good, tuple(gaps), masked, tuple(damage))
+    return Inspection(recording.n_blocks, good, tuple(gaps), masked, tuple(damage))
 
 
-def _verified(file: Path) -> dict[str, Any]:
-    from twin.rig.recorded import open_recording
+def _share(progress: Callable[[int, int], None], files_done: int, files: int, done: int, total: int) -> None:
+    """Progress within one of several files, in thousandths."""
+    progress(round(1000.0 * (files_done + done / max(total, 1))), 1000 * files)
 
+
+def _verified(file: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
     try:
-        found = inspect(file)
-        blocks = open_recording(file).n_blocks
+        found = inspect(file, progress)
     except InputError as error:
-        found, blocks = Inspection(0, (), 0, (str(error).removeprefix(f"{file}: "),)), 0
+        found = Inspection(0, 0, (), 0, (str(error).removeprefix(f"{file}: "),))
     return {
         "file": str(file),
         "whole": not found.damage,
         "good_blocks": found.good_blocks,
-        "blocks": blocks,
+        "blocks": found.blocks,
         "gaps": [list(gap) for gap in found.gaps],
         "masked_samples": found.masked,
         "damage": list(found.damage),
@@ -311,6 +337,7 @@ def _line(path: Path) -> dict[str, Any]:
             "remark": str(error).removeprefix(f"{path}: "),
         }
     return row | {
+        "bytes": sum(part.stat().st_size for part in recording.parts),
         "plant": recording.plant.name,
         "seconds": recording.end_sample / recording.sample_rate_hz,
         "commands": len(recording.commands()),
@@ -323,7 +350,9 @@ def _remark(recording: "Recording") -> str:
         return f"damaged; {recording.damaged_rows} pieces are left out"
     if recording.repaired:
         return "cut short; readable to its last whole block"
-    return "" if recording.finished else "not finished: its recorder was killed, or is still at it"
+    if not recording.finished:
+        return "not finished: its recorder was killed, or is still at it"
+    return f"in {len(recording.parts)} files" if len(recording.parts) > 1 else ""
 
 
 def _between(
