@@ -14,6 +14,7 @@ from tuning.campaign.kernel import (
     MEMORY,
     POWER_WINDOW_BLOCKS,
     TILE,
+    in_order,
     rows_of,
     run_spans,
     terms_of,
@@ -169,9 +170,8 @@ def _run_tile(cases: Sequence[Case], lanes: Sequence[_Lane], excitation: Excitat
     width, spans, fs = len(cases), excitation.spans, excitation.sample_rate_hz
     rows = len(lanes[0].coefficients[0])
     nodes = max(len(lane.coefficients) for lane in lanes)
-    # Lanes without a case run along with zeros; their cutoffs may be anything but zero.
     coefficients, weights = np.zeros((nodes, rows, TILE)), np.zeros((len(spans), nodes, TILE))
-    gains, acts = np.ones((len(spans), 2, 5, TILE)), np.zeros((len(spans), TILE))
+    gains, acts = np.empty((len(spans), 2, 5, TILE)), np.zeros((len(spans), TILE))
     constants, delays = np.zeros((10, TILE)), np.ones(TILE, dtype=np.int64)
     for c, (case, lane) in enumerate(zip(cases, lanes, strict=True)):
         coefficients[: len(lane.coefficients), :, c] = lane.coefficients
@@ -181,6 +181,8 @@ def _run_tile(cases: Sequence[Case], lanes: Sequence[_Lane], excitation: Excitat
             excitation.middle_hz <= case.schedule.on_to_hz
         )
         acts[:, c], constants[:, c], delays[c] = on, lane.constants, lane.delay
+    # Lanes without a case run along on a plant of zeros; what is alike in all others shall stay so.
+    gains[..., width:], delays[width:] = gains[..., :1], delays[0]
     n, window = lanes[0].n, POWER_WINDOW_BLOCKS
     guard = np.zeros((window + 3, TILE))
     guard[-1] = -1.0
@@ -247,14 +249,16 @@ def _lane(case: Case) -> _Lane:
         model = linear_model(plant, frequency_hz=None, damping_ns_m=own)
         discrete = discretise(model, fs, holds)  # type: ignore[arg-type]
         n, states = len(model.states), model.states
-        sums, feel = np.zeros((rows_of(n) + 2, terms_of(n))), slice(rows_of(n), None)
+        sums, feel = np.zeros((rows_of(n), terms_of(n))), slice(n, n + 2)
         last, present = _held(model.A, model.B[:, drive], discrete.B0[:, drive], facts)
-        sums[:n, :n], sums[feel, :n] = discrete.F, model.C[sensors]
+        sums[:n, :n] = discrete.F
         sums[:n, n : n + INPUTS] = np.column_stack(
             [last, present, discrete.B0[:, exciter], discrete.B1[:, exciter]]
         )
-        sums[feel, n + INPUTS - 1] = model.D[sensors, exciter]
-        rows.append(sums.ravel())
+        # What is felt is what the states are by then: its sums are of the same terms.
+        sums[feel] = model.C[sensors] @ sums[:n]
+        sums[feel, n + INPUTS - 1] += model.D[sensors, exciter]
+        rows.append(in_order(sums))
     ends = [plant.sensor[k].range or math.inf for k in pair]
     constants = np.array([
         case.amplitude, case.limit(f"{coil.name}_current_a"), ends[0], 1.0 if facts.relative else 0.0, ends[1],
@@ -331,7 +335,9 @@ def _weights(case: Case, nodes: Array, frequency_hz: Array) -> Array:
 def _packed(schedule: GainSchedule, force_constant_n_a: float, excitation: Excitation) -> Array:
     """Gains and cutoffs of every span's ends in the kernel's units, (S, 2, 5)."""
     table = _table(schedule, excitation.sample_rate_hz, excitation.edges_hz.tobytes())
-    return np.asarray(table / np.array([force_constant_n_a] * 3 + [1.0, 1.0]))
+    packed = table / np.array([force_constant_n_a] * 3 + [1.0, 1.0])
+    packed[:, 1] -= packed[:, 0]
+    return np.asarray(packed)
 
 
 @lru_cache(maxsize=8)

@@ -19,15 +19,15 @@ from tuning.campaign.kernel import (
     STROKE_PEAK,
     X_PEAK,
 )
-from tuning.loop import RigModel, margins, mode_grid
+from tuning.campaign.loops import least_margins, loop_models, slowest_pole
 from tuning.types import BudgetKind
 from twin.plant.config import DampingTable
-from twin.plant.linear import Array, ComplexArray, linear_model
+from twin.plant.linear import Array, linear_model
 
 Flags = NDArray[np.bool_]
 
-MARGIN_POINTS = 36
-"""On either side of each mode, see `tuning.loop.mode_grid`."""
+WELL_CONDITIONED = 1e9
+"""Eigenvectors worse than this are not trusted; the equations are then solved frequency by frequency."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +133,9 @@ class Judge:
         tripped_at_s
             -1 if the rig did not switch off.
         """
-        models = _models(case, [f for f in self._grid if case.schedule.acts_at(f)])
-        growth, at_hz = _slowest(case, models)
-        modulus, delay = _margins(case, models) if growth < 0.0 else (0.0, 0.0)
+        models = loop_models(case, [f for f in self._grid if case.schedule.acts_at(f)])
+        growth, at_hz = slowest_pole(case, models)
+        modulus, delay = least_margins(case, models) if growth < 0.0 else (0.0, 0.0)
         acting = (self._excitation.middle_hz >= case.schedule.on_from_hz) & (
             self._excitation.middle_hz <= case.schedule.on_to_hz
         )
@@ -218,6 +218,16 @@ class Judge:
 def passive_motion(case: Case, frequency_hz: Array) -> Array:
     """Largest |x1| of the plant in steady state without control [m], (n,): the coil's reference is zero."""
     plant, absorber = case.plant, case.plant.absorber
+    if absorber is None or not isinstance(absorber.damping_ns_m, DampingTable):
+        model = linear_model(plant, frequency_hz=50.0)
+        decays, vectors = np.linalg.eig(model.A)
+        if np.linalg.cond(vectors) < WELL_CONDITIONED:
+            # In modes one product for each frequency.
+            row, into = model.states.index(f"x_{plant.primary.name}"), model.inputs.index(case.exciter)
+            shares = vectors[row] * np.linalg.solve(vectors, model.B[:, into].astype(np.complex128))
+            return np.asarray(
+                case.amplitude * np.abs((1.0 / (2j * np.pi * frequency_hz[:, None] - decays)) @ shares)
+            )
     name = "" if absorber is None else absorber.name
     own = [linear_model(plant, frequency_hz=50.0, damping_ns_m={name: c} if name else {}) for c in (0.0, 1.0)]
     damping = np.array([0.0 if absorber is None else absorber.damping_at(float(f)) for f in frequency_hz])
@@ -228,44 +238,3 @@ def passive_motion(case: Case, frequency_hz: Array) -> Array:
     states = np.linalg.solve(resolvent, np.broadcast_to(into[:, None], (len(A), len(into), 1)))
     row = own[0].states.index(f"x_{plant.primary.name}")
     return np.asarray(case.amplitude * np.abs(states[:, row, 0]))
-
-
-def _models(case: Case, grid: Sequence[float]) -> list[tuple[float, RigModel]]:
-    """The loop's model at each frequency; one for all of them where nothing in the plant depends on it."""
-    if not grid:
-        return []
-    if any(isinstance(body.damping_ns_m, DampingTable) for body in case.plant.body):
-        return [(f, RigModel(case.plant, case.facts, f)) for f in grid]
-    model = RigModel(case.plant, case.facts, grid[0])
-    return [(f, model) for f in grid]
-
-
-def _slowest(case: Case, models: Sequence[tuple[float, RigModel]]) -> tuple[float, float | None]:
-    """Largest real part of the closed loop's poles over the grid [1/s], and where [Hz].
-
-    Without a frequency at which the schedule acts there is no loop; a plant by itself is stable.
-    """
-    if not models:
-        return -math.inf, None
-    loops = np.stack([model.closed_loop_matrix(case.schedule.at(f)) for f, model in models])
-    largest = np.abs(np.linalg.eigvals(loops)).max(axis=1)
-    k = int(np.argmax(largest))
-    return float(np.log(largest[k]) * case.facts.sample_rate_hz), models[k][0]
-
-
-def _margins(case: Case, models: Sequence[tuple[float, RigModel]]) -> tuple[float, float | None]:
-    """Least modulus and delay margin over the grid, see `tuning.loop.margins`."""
-    modulus, delay = (math.inf, math.inf) if models else (1.0, math.inf)
-    grid: Array = np.zeros(0)
-    acceleration: ComplexArray = np.zeros(0, dtype=np.complex128)
-    before: RigModel | None = None
-    for f, model in models:
-        if model is not before:
-            grid = mode_grid(model, MARGIN_POINTS)
-            acceleration, before = model.acceleration(grid), model
-        gains = case.schedule.at(f)
-        terms = -acceleration[:, None] * model.paths(grid, gains.low_pass_hz, gains.high_pass_hz)
-        found = margins(terms, grid, gains)
-        modulus = min(modulus, found.modulus)
-        delay = min(delay, math.inf if found.delay_s is None else found.delay_s)
-    return modulus, delay if math.isfinite(delay) else None

@@ -17,10 +17,13 @@ from twin.plant.linear import Array
 
 Whole = NDArray[np.int64]
 
-TILE = 72
+TILE = 32
 """Cases side by side. Rows a power of two apart would fall on each other in the first-level cache."""
 
-CHUNK = 5
+TOGETHER = 4
+"""Sums computed at once."""
+
+CHUNK, FEWEST = 5, 10
 """Terms of a sum are padded with zeros to whole chunks, at least two of them."""
 
 INPUTS = 4
@@ -68,96 +71,141 @@ MEMORY = 16 * TILE
 
 
 def rows_of(states: int) -> int:
-    """Sums for the states, which are computed in pairs; those of both accelerometers follow."""
-    return states + states % 2
+    """Sums for the states and both accelerometers, padded to a whole number of those computed at once."""
+    return -(-(states + 2) // TOGETHER) * TOGETHER
 
 
 def terms_of(states: int) -> int:
     """Terms of every sum for a plant of so many states, padding included."""
-    return max(2, -(-(states + INPUTS) // CHUNK)) * CHUNK
+    return max(FEWEST, -(-(states + INPUTS) // CHUNK) * CHUNK)
+
+
+def in_order(factors: Array) -> Array:
+    """Factors (rows, terms) in the order in which `run_spans` takes them: first terms of all rows, then chunks."""
+    parts = [factors[:, :FEWEST]] + [
+        factors[:, j : j + CHUNK] for j in range(FEWEST, factors.shape[1], CHUNK)
+    ]
+    return np.concatenate([part.ravel() for part in parts])
 
 
 @kernel
-def _sums(coefficients: Array, z: Array, out: Array, first: int, last: int, terms: int) -> None:
-    """Rows ``first`` to ``last`` of the coefficients times z, lane by lane, two rows for each time z is loaded."""
-    for i in range(first, last, 2):
-        row = coefficients[i * terms * TILE : (i + 1) * terms * TILE]
-        next_row = coefficients[(i + 1) * terms * TILE : (i + 2) * terms * TILE]
-        into = out[i * TILE : (i + 2) * TILE]
+def _sums(coefficients: Array, z: Array, out: Array, rows: int, terms: int) -> None:
+    """Coefficients times z, lane by lane, four rows for each time z is loaded."""
+    for i in range(0, rows, TOGETHER):
+        block = coefficients[i * FEWEST * TILE : (i + TOGETHER) * FEWEST * TILE]
+        into = out[i * TILE : (i + TOGETHER) * TILE]
         for c in range(TILE):
+            # Read once: the compiler does not know that what is written is not z.
+            z0 = z[c]
+            z1 = z[TILE + c]
+            z2 = z[2 * TILE + c]
+            z3 = z[3 * TILE + c]
+            z4 = z[4 * TILE + c]
+            z5 = z[5 * TILE + c]
+            z6 = z[6 * TILE + c]
+            z7 = z[7 * TILE + c]
+            z8 = z[8 * TILE + c]
+            z9 = z[9 * TILE + c]
             into[c] = (
-                row[c] * z[c]
-                + row[TILE + c] * z[TILE + c]
-                + row[2 * TILE + c] * z[2 * TILE + c]
-                + row[3 * TILE + c] * z[3 * TILE + c]
-                + row[4 * TILE + c] * z[4 * TILE + c]
-                + row[5 * TILE + c] * z[5 * TILE + c]
-                + row[6 * TILE + c] * z[6 * TILE + c]
-                + row[7 * TILE + c] * z[7 * TILE + c]
-                + row[8 * TILE + c] * z[8 * TILE + c]
-                + row[9 * TILE + c] * z[9 * TILE + c]
+                block[c] * z0
+                + block[TILE + c] * z1
+                + block[2 * TILE + c] * z2
+                + block[3 * TILE + c] * z3
+                + block[4 * TILE + c] * z4
+                + block[5 * TILE + c] * z5
+                + block[6 * TILE + c] * z6
+                + block[7 * TILE + c] * z7
+                + block[8 * TILE + c] * z8
+                + block[9 * TILE + c] * z9
             )
             into[TILE + c] = (
-                next_row[c] * z[c]
-                + next_row[TILE + c] * z[TILE + c]
-                + next_row[2 * TILE + c] * z[2 * TILE + c]
-                + next_row[3 * TILE + c] * z[3 * TILE + c]
-                + next_row[4 * TILE + c] * z[4 * TILE + c]
-                + next_row[5 * TILE + c] * z[5 * TILE + c]
-                + next_row[6 * TILE + c] * z[6 * TILE + c]
-                + next_row[7 * TILE + c] * z[7 * TILE + c]
-                + next_row[8 * TILE + c] * z[8 * TILE + c]
-                + next_row[9 * TILE + c] * z[9 * TILE + c]
+                block[10 * TILE + c] * z0
+                + block[11 * TILE + c] * z1
+                + block[12 * TILE + c] * z2
+                + block[13 * TILE + c] * z3
+                + block[14 * TILE + c] * z4
+                + block[15 * TILE + c] * z5
+                + block[16 * TILE + c] * z6
+                + block[17 * TILE + c] * z7
+                + block[18 * TILE + c] * z8
+                + block[19 * TILE + c] * z9
             )
-        for j in range(2 * CHUNK, terms, CHUNK):
-            more, next_more = row[j * TILE : (j + CHUNK) * TILE], next_row[j * TILE : (j + CHUNK) * TILE]
-            rest = z[j * TILE : (j + CHUNK) * TILE]
+            into[2 * TILE + c] = (
+                block[20 * TILE + c] * z0
+                + block[21 * TILE + c] * z1
+                + block[22 * TILE + c] * z2
+                + block[23 * TILE + c] * z3
+                + block[24 * TILE + c] * z4
+                + block[25 * TILE + c] * z5
+                + block[26 * TILE + c] * z6
+                + block[27 * TILE + c] * z7
+                + block[28 * TILE + c] * z8
+                + block[29 * TILE + c] * z9
+            )
+            into[3 * TILE + c] = (
+                block[30 * TILE + c] * z0
+                + block[31 * TILE + c] * z1
+                + block[32 * TILE + c] * z2
+                + block[33 * TILE + c] * z3
+                + block[34 * TILE + c] * z4
+                + block[35 * TILE + c] * z5
+                + block[36 * TILE + c] * z6
+                + block[37 * TILE + c] * z7
+                + block[38 * TILE + c] * z8
+                + block[39 * TILE + c] * z9
+            )
+    # Larger plants have more terms; their coefficients follow those of the first.
+    for j in range(FEWEST, terms, CHUNK):
+        rest = z[j * TILE : (j + CHUNK) * TILE]
+        for i in range(rows):
+            block = coefficients[(j * rows + i * CHUNK) * TILE : (j * rows + (i + 1) * CHUNK) * TILE]
+            into = out[i * TILE : (i + 1) * TILE]
             for c in range(TILE):
                 into[c] += (
-                    more[c] * rest[c]
-                    + more[TILE + c] * rest[TILE + c]
-                    + more[2 * TILE + c] * rest[2 * TILE + c]
-                    + more[3 * TILE + c] * rest[3 * TILE + c]
-                    + more[4 * TILE + c] * rest[4 * TILE + c]
-                )
-                into[TILE + c] += (
-                    next_more[c] * rest[c]
-                    + next_more[TILE + c] * rest[TILE + c]
-                    + next_more[2 * TILE + c] * rest[2 * TILE + c]
-                    + next_more[3 * TILE + c] * rest[3 * TILE + c]
-                    + next_more[4 * TILE + c] * rest[4 * TILE + c]
+                    block[c] * rest[c]
+                    + block[TILE + c] * rest[TILE + c]
+                    + block[2 * TILE + c] * rest[2 * TILE + c]
+                    + block[3 * TILE + c] * rest[3 * TILE + c]
+                    + block[4 * TILE + c] * rest[4 * TILE + c]
                 )
 
 
 @kernel
-def _show(sums: Array, noise: Array, limit: Array, weight: Array, memory: Array, first: bool) -> None:
-    """Add what one accelerometer shows to the relative acceleration; no noise where the array has no entries."""
+def _show(sums: Array, noise: Array, constants: Array, memory: Array) -> None:
+    """Relative acceleration of what both accelerometers show; no noise where the array has no entries."""
+    low, high = sums[:TILE], sums[TILE : 2 * TILE]
     if len(noise) > 0:
         for c in range(TILE):
-            sums[c] += noise[c]
-    if first:
+            low[c] += noise[0, c]
         for c in range(TILE):
-            memory[ACCELERATION + c] = weight[c] * min(max(sums[c], -limit[c]), limit[c])
-    else:
-        for c in range(TILE):
-            memory[ACCELERATION + c] += weight[c] * min(max(sums[c], -limit[c]), limit[c])
+            high[c] += noise[1, c]
+    first, second = constants[RANGE_1], constants[RANGE_2]
+    weight, other = constants[WEIGHT_1], constants[WEIGHT_2]
+    for c in range(TILE):
+        memory[ACCELERATION + c] = weight[c] * min(max(low[c], -first[c]), first[c]) + other[c] * min(
+            max(high[c], -second[c]), second[c]
+        )
 
 
 @kernel
-def _cutoffs(memory: Array, begin: Array, end: Array, w: float, dt: float) -> None:
-    """Coefficients of the filter chain a share ``w`` of the way through a span."""
-    for c in range(TILE):
-        g_low = begin[3 * TILE + c] + w * (end[3 * TILE + c] - begin[3 * TILE + c])
-        g_high = begin[4 * TILE + c] + w * (end[4 * TILE + c] - begin[4 * TILE + c])
+def _cutoffs(memory: Array, begin: Array, change: Array, w: float, dt: float, alike: bool) -> None:
+    """Coefficients of the filter chain a share ``w`` of the way through a span, once for all if they are alike."""
+    count = 1 if alike else TILE
+    for c in range(count):
+        g_low = begin[3 * TILE + c] + w * change[3 * TILE + c]
+        g_high = begin[4 * TILE + c] + w * change[4 * TILE + c]
         memory[G_LOW + c] = g_low
         memory[D_LOW + c] = 1.0 / (1.0 + g_low * (g_low + SQRT2))
         memory[G_HIGH + c] = g_high
         memory[D_HIGH + c] = 1.0 / (1.0 + g_high * (g_high + SQRT2))
         memory[SCALE + c] = dt / (2.0 * g_high)
+    if alike:
+        for row in range(G_LOW, SCALE + 1, TILE):
+            memory[row : row + TILE] = memory[row]
 
 
 @kernel
-def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w: float) -> None:
+def _law(memory: Array, begin: Array, change: Array, clamp: Array, stroke: Array, w: float) -> None:
     """Filter chain, gains and clamp, as `twin.control.chain.chain_step` and `twin.control.rig_block`."""
     # In stages: a chain of operations that wait for each other is short enough for several lanes to overlap.
     for c in range(TILE):
@@ -189,46 +237,45 @@ def _law(memory: Array, begin: Array, end: Array, clamp: Array, stroke: Array, w
         memory[STROKE + c] = memory[SCALE + c] * band
     for c in range(TILE):
         command = (
-            (begin[c] + w * (end[c] - begin[c])) * memory[ACCELERATION + c]
-            + (begin[TILE + c] + w * (end[TILE + c] - begin[TILE + c])) * memory[SPEED + c]
-            + (begin[2 * TILE + c] + w * (end[2 * TILE + c] - begin[2 * TILE + c])) * memory[STROKE + c]
+            (begin[c] + w * change[c]) * memory[ACCELERATION + c]
+            + (begin[TILE + c] + w * change[TILE + c]) * memory[SPEED + c]
+            + (begin[2 * TILE + c] + w * change[2 * TILE + c]) * memory[STROKE + c]
         )
         bounded = min(max(command, -clamp[c]), clamp[c])
         # Gains beyond all measure make inf - inf: what is no number must not reach the converter.
         bounded = bounded if command == command else 0.0  # noqa: PLR0124
         memory[COMMAND + c] = bounded if memory[ACTING + c] > 0.0 else 0.0
-        stroke[c] = max(stroke[c], abs(memory[STROKE + c]))
+        stroke[c] = max(stroke[c] + 0.0, abs(memory[STROKE + c]))
 
 
 @kernel
-def _gather(z: Array, held: Array, memory: Array, figures: Array, places: Whole, constants: Array) -> None:
+def _gather(
+    z: Array, held: Array, figures: Array, heating: Array, places: Whole, constants: Array, grounded: bool
+) -> None:
     """Add a sample to the figures of a span."""
-    x, i = z[places[0] * TILE : (places[0] + 1) * TILE], z[places[5] * TILE : (places[5] + 1) * TILE]
-    end, end_v = z[places[1] * TILE : (places[1] + 1) * TILE], z[places[2] * TILE : (places[2] + 1) * TILE]
-    if places[3] >= 0:
-        base, base_v = (
-            z[places[3] * TILE : (places[3] + 1) * TILE],
-            z[places[4] * TILE : (places[4] + 1) * TILE],
-        )
-        for c in range(TILE):
-            memory[STROKE + c] = end[c] - base[c]
-        for c in range(TILE):
-            memory[SPEED + c] = end_v[c] - base_v[c]
-    else:
-        for c in range(TILE):
-            memory[STROKE + c] = end[c]
-        for c in range(TILE):
-            memory[SPEED + c] = end_v[c]
-    force = constants[FORCE_CONSTANT]
-    clamp = constants[CLAMP]
+    x, i = _lanes(z, places[0]), _lanes(z, places[5])
+    end, end_v = _lanes(z, places[1]), _lanes(z, places[2])
+    base, base_v = (end, end_v) if grounded else (_lanes(z, places[3]), _lanes(z, places[4]))
+    stands = 0.0 if grounded else 1.0
+    force, clamp = constants[FORCE_CONSTANT], constants[CLAMP]
+    # The added zero keeps what is written from being what was read: the compiler would store only where it differs,
+    # lane by lane.
     for c in range(TILE):
-        figures[X_PEAK * TILE + c] = max(figures[X_PEAK * TILE + c], abs(x[c]))
-        figures[STROKE_PEAK * TILE + c] = max(figures[STROKE_PEAK * TILE + c], abs(memory[STROKE + c]))
-        figures[CURRENT_PEAK * TILE + c] = max(figures[CURRENT_PEAK * TILE + c], abs(i[c]))
+        figures[X_PEAK * TILE + c] = max(figures[X_PEAK * TILE + c] + 0.0, abs(x[c]))
+        figures[CURRENT_PEAK * TILE + c] = max(figures[CURRENT_PEAK * TILE + c] + 0.0, abs(i[c]))
         figures[CURRENT_SQUARES * TILE + c] += i[c] * i[c]
-        figures[MOTION_WORK * TILE + c] += force[c] * i[c] * memory[SPEED + c]
-    for c in range(TILE):
         figures[SATURATED * TILE + c] += 1.0 if abs(held[c]) >= clamp[c] else 0.0
+    for c in range(TILE):
+        heating[c] += held[c] * held[c]
+        stroke = abs(end[c] - stands * base[c])
+        figures[STROKE_PEAK * TILE + c] = max(figures[STROKE_PEAK * TILE + c] + 0.0, stroke)
+        figures[MOTION_WORK * TILE + c] += force[c] * i[c] * (end_v[c] - stands * base_v[c])
+
+
+@kernel
+def _lanes(rows: Array, row: int) -> Array:
+    """One row of a flat array."""
+    return rows[row * TILE : (row + 1) * TILE]
 
 
 @kernel
@@ -259,12 +306,12 @@ def run_spans(
     Parameters
     ----------
     coefficients
-        (Q, (rows_of(n) + 2) * terms * TILE) discrete plants at Q values of the absorber's damping: for each state and
-        both accelerometers the factors of states, last and present command, last and present excitation.
+        (Q, rows_of(n) * terms * TILE) discrete plants at Q values of the absorber's damping, `in_order`: for each state
+        and accelerometer the factors of states, last and present command, last and present excitation.
     weights
         (S, Q, TILE) share of each of them in a span.
     gains
-        (S, 2, 5 * TILE) alpha/k, beta/k, gamma/k and tan(pi f dt) of both cutoffs at the ends of each span.
+        (S, 2, 5 * TILE) alpha/k, beta/k, gamma/k and tan(pi f dt) of both cutoffs where a span begins, and their change
     acts
         (S, TILE) 1 where the schedule acts.
     spans
@@ -295,27 +342,30 @@ def run_spans(
     longest, window = len(line), POWER_WINDOW_BLOCKS
     origin = int(spans[0, 0])
     head, blocks, in_block = int(counters[0]), int(counters[1]), int(counters[2])
-    current = z[places[5] * TILE : (places[5] + 1) * TILE]
-    last, present = z[n * TILE : (n + 1) * TILE], z[(n + 1) * TILE : (n + 2) * TILE]
-    before, now = z[(n + 2) * TILE : (n + 3) * TILE], z[(n + 3) * TILE : (n + 4) * TILE]
-    rows = n + n % 2
-    sums = np.zeros((rows + 2) * TILE)
-    first_sum, second_sum = sums[rows * TILE : (rows + 1) * TILE], sums[(rows + 1) * TILE :]
-    amplitude, quiet = constants[AMPLITUDE], np.empty(0)
+    rows = len(blended) // (terms * TILE)
+    x, inputs = z, z[n * TILE : (n + INPUTS) * TILE]
+    sums = np.zeros(rows * TILE)
+    amplitude, quiet = constants[AMPLITUDE], np.empty((0, TILE))
     heating, stroke, tripped = guard[window], guard[window + 1], guard[window + 2]
+    grounded, current = places[3] < 0, _lanes(x, places[5])
+    together = True
+    for c in range(TILE):
+        together &= delays[c] == delays[0]
     for s in range(len(spans)):
         begin, end = int(spans[s, 0]), int(spans[s, 1])
-        for r in range((rows + 2) * terms):
-            into = blended[r * TILE : (r + 1) * TILE]
+        for r in range(rows * terms):
+            into = _lanes(blended, r)
             into[:] = 0.0
             for q in range(len(coefficients)):
                 node = coefficients[q, r * TILE : (r + 1) * TILE]
                 for c in range(TILE):
                     into[c] += weights[s, q, c] * node[c]
-        out, from_gains, to_gains = figures[s], gains[s, 0], gains[s, 1]
-        moving = False
-        for c in range(3 * TILE, 5 * TILE):
-            moving |= from_gains[c] != to_gains[c]
+        out, from_gains, change = figures[s], gains[s, 0], gains[s, 1]
+        moving, alike = False, True
+        for row in (3, 4):
+            for c in range(row * TILE, (row + 1) * TILE):
+                moving |= change[c] != 0.0
+                alike &= from_gains[c] == from_gains[row * TILE] and change[c] == change[row * TILE]
         out[:] = 0.0
         for c in range(TILE):
             memory[ACTING + c] = acts[s, c] if tripped[c] < 0.0 else 0.0
@@ -323,36 +373,31 @@ def run_spans(
             out[STORED * TILE + c] = -0.5 * constants[INDUCTANCE, c] * current[c] ** 2
         for k in range(begin, end):
             w = (k - begin) / (end - begin)
+            held = line[head]  # computed as many samples ago as the delay is long
             for c in range(TILE):
-                present[c] = line[head, c]  # computed as many samples ago as the delay is long
+                inputs[c] = inputs[TILE + c]
+                inputs[2 * TILE + c] = amplitude[c] * shape[k]
+                inputs[3 * TILE + c] = amplitude[c] * shape[k + 1]
             for c in range(TILE):
-                before[c] = amplitude[c] * shape[k]
-            for c in range(TILE):
-                now[c] = amplitude[c] * shape[k + 1]
-            _sums(blended, z, sums, 0, rows, terms)
+                inputs[TILE + c] = held[c]
+            _sums(blended, x, sums, rows, terms)
             for c in range(n * TILE):
-                z[c] = sums[c]
-            for c in range(TILE):
-                last[c] = present[c]
-            _sums(blended, z, sums, rows, rows + 2, terms)
-            _show(
-                first_sum, noise[k - origin, 0] if len(noise) > 0 else quiet, constants[RANGE_1],
-                constants[WEIGHT_1], memory, True,
-            )  # fmt: skip
-            _show(
-                second_sum, noise[k - origin, 1] if len(noise) > 0 else quiet, constants[RANGE_2],
-                constants[WEIGHT_2], memory, False,
-            )  # fmt: skip
+                x[c] = sums[c]
+            _show(sums[n * TILE :], noise[k - origin] if len(noise) > 0 else quiet, constants, memory)
             if moving or k == begin:
-                _cutoffs(memory, from_gains, to_gains, w, dt)
-            _law(memory, from_gains, to_gains, constants[CLAMP], stroke, w)
-            for c in range(TILE):
-                heating[c] += present[c] * present[c]
-            for c in range(TILE):
-                slot = head + delays[c]
-                line[slot if slot < longest else slot - longest, c] = memory[COMMAND + c]
+                _cutoffs(memory, from_gains, change, w, dt, alike)
+            _law(memory, from_gains, change, constants[CLAMP], stroke, w)
+            _gather(x, held, out, heating, places, constants, grounded)
+            if together:
+                slot = head + delays[0]
+                into = line[slot if slot < longest else slot - longest]
+                for c in range(TILE):
+                    into[c] = memory[COMMAND + c]
+            else:
+                for c in range(TILE):
+                    slot = head + delays[c]
+                    line[slot if slot < longest else slot - longest, c] = memory[COMMAND + c]
             head = head + 1 if head + 1 < longest else 0
-            _gather(z, present, memory, out, places, constants)
         in_block += end - begin
         for c in range(TILE):
             out[STORED * TILE + c] += 0.5 * constants[INDUCTANCE, c] * current[c] ** 2

@@ -10,12 +10,13 @@ offset would run away with.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from twin.plant.compiled import kernel
-from twin.plant.linear import Array, ComplexArray
+from twin.plant.linear import Array, ComplexArray, read_only
 
 CHAIN_STATES = 6
 SQRT2 = math.sqrt(2.0)
@@ -77,6 +78,7 @@ def chain_response(
     return np.stack([low, low * integrate, low * integrate**2], axis=-1)
 
 
+@lru_cache(maxsize=512)
 def chain_matrices(
     low_pass_hz: float, high_pass_hz: float, sample_rate_hz: float
 ) -> tuple[Array, Array, Array, Array]:
@@ -85,7 +87,7 @@ def chain_matrices(
     Returns
     -------
     tuple of ndarray
-        A (6, 6), B (6, 1), C (3, 6), D (3, 1) of ``s+ = A s + B a``, ``(a, v, x) = C s + D a``.
+        A (6, 6), B (6, 1), C (3, 6), D (3, 1) of ``s+ = A s + B a``, ``(a, v, x) = C s + D a``; read-only.
     """
     dt = 1.0 / sample_rate_hz
     g_low, g_high = math.tan(math.pi * low_pass_hz * dt), math.tan(math.pi * high_pass_hz * dt)
@@ -98,4 +100,4 @@ def chain_matrices(
         A[:, column] = s
     s = np.zeros(n)
     D = np.array(chain_step(s, 1.0, g_low, g_high, dt))[:, None]
-    return A, s[:, None], C, D
+    return read_only(A), read_only(s[:, None]), read_only(C), read_only(D)
