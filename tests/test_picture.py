@@ -13,7 +13,8 @@ from twin.plant.files import load_plant
 from twin.rig.recording import Recorder
 from twin.station import picture
 from twin.station.picture import save_picture
-from twin.station.rerun_view import KEPT, RerunView
+from twin.station.rerun_view import RerunView
+from twin.station.view.pace import KEPT
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ from twin.rig.recorded import open_recording
 from twin.station.curve_plot import HEIGHT, WIDTH, Axes, axes_for
 from twin.station.frame import Frame
 from twin.station.live import LiveView
-from twin.station.rerun_view import WATCHED, Pace, RerunView, describe
+from twin.station.rerun_view import RerunView, describe
+from twin.station.view.pace import WATCHED, Pace
 
 Rows = dict[str, list[tuple[float, object]]]
 

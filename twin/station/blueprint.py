@@ -11,7 +11,6 @@ from twin.station.view import spectrum_plot
 from twin.station.view.spectrum import BINS
 from twin.station.view.still import ROOT as SCHEMATIC
 
-WAVEFORM_S = 0.12
 _BACKGROUND = [13, 16, 17]
 
 
@@ -27,6 +26,8 @@ class Layout:
         Name and unit of the channel whose spectrum is shown; empty if there is none.
     bounds
         Ranges of x and y of the schematic.
+    waveform_s
+        Width of the window in which waveforms are shown [s].
     trend_s, follow
         As of `twin.station.rerun_view.Pace`.
     """
@@ -35,6 +36,7 @@ class Layout:
     waveforms: tuple[tuple[str, str], ...]
     spectrum: str
     bounds: tuple[tuple[float, float], tuple[float, float]]
+    waveform_s: float
     trend_s: float | None
     follow: bool
 
@@ -112,7 +114,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 def _waveforms(layout: Layout) -> list[rrb.TimeSeriesView]:
     return [
-        _waveform(path, f"{name}: measured, twin" if k == 0 else name)
+        _waveform(path, f"{name}: measured, twin" if k == 0 else name, layout.waveform_s)
         for k, (path, name) in enumerate(layout.waveforms)
     ]
 
@@ -120,9 +122,9 @@ def _waveforms(layout: Layout) -> list[rrb.TimeSeriesView]:
 def _estimates(layout: Layout, trend: rrb.VisibleTimeRange | None) -> list[rrb.TimeSeriesView]:
     """What nothing measures, with one standard deviation to either side."""
     plant = layout.plant
-    views = [_waveform("estimate/primary", f"{plant.primary.name} estimated ±1σ [µm]")]
+    views = [_waveform("estimate/primary", f"{plant.primary.name} estimated ±1σ [µm]", layout.waveform_s)]
     if plant.absorber is not None:
-        views.append(_waveform("estimate/stroke", "Stroke ±1σ [mm]"))
+        views.append(_waveform("estimate/stroke", "Stroke ±1σ [mm]", layout.waveform_s))
     if plant.voice_coil is not None and any(isinstance(a, ForceActuator) for a in plant.actuator):
         views.append(_trend("estimate/force", "Unmeasured force ±1σ [N]", trend))
     return views
@@ -183,10 +185,10 @@ def _legend(window: rrb.VisibleTimeRange | None) -> rrb.PlotLegend:
     return rrb.PlotLegend(rrb.Corner2D.RightTop if window is None else rrb.Corner2D.LeftTop)
 
 
-def _waveform(origin: str, name: str) -> rrb.TimeSeriesView:
+def _waveform(origin: str, name: str, width_s: float) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        time_ranges=_window(WAVEFORM_S),
+        time_ranges=_window(width_s),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )

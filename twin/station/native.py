@@ -55,7 +55,11 @@ class Broadcast:
         self.url = f"rerun+http://{HOST}:{port}/proxy"
         stream.set_sinks(
             rr.GrpcServerSink(
-                bind_ip=HOST, port=port, server_memory_limit=memory_limit, cors_allow_origin=list(origins)
+                bind_ip=HOST,
+                port=port,
+                server_memory_limit=memory_limit,
+                newest_first=True,  # who comes late sees what is now, and then what was
+                cors_allow_origin=list(origins),
             )
         )
 

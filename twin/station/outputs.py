@@ -17,8 +17,9 @@ from twin.station.answers import note, software
 from twin.station.frame import Frame
 from twin.station.live import LiveView
 from twin.station.native import Broadcast, NativeViewer, ViewerKeeper
-from twin.station.rerun_view import KEPT, WATCHED, Pace, RerunView
+from twin.station.rerun_view import RerunView
 from twin.station.session import Session
+from twin.station.view.pace import KEPT, WATCHED, Pace
 from twin.station.web import WebViewer
 
 

@@ -4,7 +4,7 @@ Everything is on one timeline, ``time`` since the start of the recording. Raw da
 recorder keeps it (``/record``).
 """
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 import rerun as rr
@@ -21,11 +21,13 @@ from twin.station.columns import TIMELINE, Columns, nanoseconds
 from twin.station.curve_plot import Axes, axes_for, log_axes, log_curve
 from twin.station.frame import ROUTINE, Frame
 from twin.station.view.groups import groups_of, spectrum_column
+from twin.station.view.pace import WATCHED, Pace
 from twin.station.view.schematic import Schematic
 from twin.station.view.spectrum_plot import SpectrumPlot
 from twin.station.view.styles import log_styles
 
 SHOWN_HZ = 1000.0
+WAVEFORM_PERIODS = 6.0
 _MICRO, _MILLI = 1e6, 1e3
 _BAND_95 = 1.96
 
@@ -34,38 +36,6 @@ SHOWN_NIS = 10.0
 
 REPEAT_S = 60.0
 """What is said when it changes is said again so often, for a viewer that has come since and does not have it all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """How much of a run is shown, and how often.
-
-    Attributes
-    ----------
-    hold_blocks, hold_slow_blocks
-        Blocks to collect before series are sent: those of many samples, and those of one per block.
-    trend_s
-        Width of the window in which slow quantities are shown [s]; None for the whole run.
-    follow
-        Whether the viewer keeps up with the end of the data.
-    spectrum_s, curve_s, image_s
-        Time between spectra, between curves of the damping, and between images of the waterfall [s].
-    """
-
-    hold_blocks: int
-    hold_slow_blocks: int
-    trend_s: float | None
-    follow: bool
-    spectrum_s: float
-    curve_s: float
-    image_s: float
-
-
-WATCHED = Pace(1, 5, trend_s=30.0, follow=True, spectrum_s=0.1, curve_s=0.5, image_s=0.5)
-"""For people who look on as it happens."""
-
-KEPT = Pace(50, 50, trend_s=None, follow=False, spectrum_s=1.0, curve_s=1.0, image_s=5.0)
-"""For a file that is looked at afterwards."""
 
 
 class RerunView:
@@ -110,6 +80,7 @@ class RerunView:
         self._curve_at_s = -np.inf
         self._repeat_at_s = REPEAT_S
         self._groups = groups_of(plant, channels)
+        own_hz = _own_hz(plant)
         self._schematic = Schematic(stream, self._fast, plant)
         self._spectral = spectrum_column(plant, channels)
         self._spectrum: SpectrumPlot | None = None
@@ -118,7 +89,7 @@ class RerunView:
             channel = channels[self._spectral]
             spectrum_name = f"{channel.name} [{channel.unit}]"
             self._spectrum = SpectrumPlot(
-                stream, sample_rate_hz, _top_hz(plant), whole=pace.trend_s is None,
+                stream, sample_rate_hz, _top_hz(own_hz), whole=pace.trend_s is None,
                 line_s=pace.spectrum_s, image_s=pace.image_s,
             )  # fmt: skip
         layout = Layout(
@@ -126,6 +97,7 @@ class RerunView:
             waveforms=tuple((g.path, g.path.removeprefix("waveform/")) for g in self._groups),
             spectrum=spectrum_name,
             bounds=self._schematic.bounds,
+            waveform_s=WAVEFORM_PERIODS / own_hz,
             trend_s=pace.trend_s,
             follow=pace.follow,
         )
@@ -342,9 +314,13 @@ def describe(plant: Plant) -> str:
     return "\n".join([*lines, "", f"configuration `{plant.fingerprint}`"])
 
 
-def _top_hz(plant: Plant) -> float:
-    """Highest frequency of the spectrum: five times that of the absorber, or of the plant's only body, rounded."""
+def _own_hz(plant: Plant) -> float:
+    """Natural frequency of the absorber, or of the plant's only body: about how fast it shakes."""
     body = plant.absorber or plant.primary
-    wanted = 5.0 * np.sqrt(body.stiffness_n_m / body.mass_kg) / (2.0 * np.pi)
-    round_ones = np.array([1.0, 2.5, 5.0, 10.0]) * 10.0 ** np.floor(np.log10(wanted))
-    return float(round_ones[np.argmin(np.abs(np.log(round_ones / wanted)))])
+    return math.sqrt(body.stiffness_n_m / body.mass_kg) / math.tau
+
+
+def _top_hz(own_hz: float) -> float:
+    """Highest frequency of the spectrum: five times the plant's own, rounded."""
+    round_ones = np.array([1.0, 2.5, 5.0, 10.0]) * 10.0 ** np.floor(np.log10(5.0 * own_hz))
+    return float(round_ones[np.argmin(np.abs(np.log(round_ones / (5.0 * own_hz))))])

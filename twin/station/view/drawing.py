@@ -84,12 +84,14 @@ class Drawing:
     @property
     def bar(self) -> tuple[float, float]:
         """Middle of the bar that tells the scale of the motion."""
-        return self.size[0] - 2.0, self.size[1] + RULER_Y
+        right, bottom = self.size
+        return max(right - 2.0, self.loupe[0] + LOUPE + 16.0), bottom + RULER_Y
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Range of x and of y that holds everything."""
         right, bottom = self.size
+        right = max(right, self.bar[0])
         return (-8.0, right + 11.0), (-0.5 * BODY_HEIGHT - 18.0, bottom + RULER_Y + 11.0)
 
     @property

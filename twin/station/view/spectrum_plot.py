@@ -16,6 +16,9 @@ from twin.station.view.spectrum import BINS, SlidingSpectrum, Waterfall
 ROOT = "spectrum"
 HEIGHT, ROWS, SPACE = 64.0, 75, 13.0
 DECADES = 6
+GROWTH = 0.15
+"""Share by which a run grows from one image of all of it to the next."""
+
 _GRID, _TEXT = 0x37474FFF, 0xB0BEC5FF
 
 
@@ -72,8 +75,8 @@ class SpectrumPlot:
         self._draw_lines(amplitudes, excitation_hz)
         if end_s >= self._image_at_s - 1e-9:
             # An image of the whole run changes the slower the more there is of it.
-            rows_s = 0.03 * self._waterfall.length_s if self._whole else 0.0
-            self._image_at_s = end_s + max(self._image_s, rows_s)
+            grown_s = GROWTH * self._waterfall.length_s if self._whole else 0.0
+            self._image_at_s = end_s + max(self._image_s, grown_s)
             self._draw_image()
 
     def repeat(self) -> None:
