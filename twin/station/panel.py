@@ -83,6 +83,7 @@ class Panel:
     _spent: deque[float] = field(default_factory=lambda: deque(maxlen=POWER_BLOCKS))
     _loads: deque[float] = field(default_factory=lambda: deque(maxlen=20))
     _sent: dict[str, Any] | None = None
+    _refusal: dict[str, Any] | None = None
     _audit: AuditPoint | None = None
     _troubles: tuple[int, float] = (0, -math.inf)
 
@@ -134,6 +135,7 @@ class Panel:
             "standing": self._standing(),
             "can_revert": retuning is not None and retuning.can_revert,
             "sent": self._sent,
+            "refusal": self._refusal,
             "audit": None if self._audit is None else audit_figures(self._audit),
             "alarms": self._alarms(frame, load, wire, goal),
             # At every start the rig has been without a station for a while: no alarm, but to be known.
@@ -218,6 +220,10 @@ class Panel:
             if answer.accepted:
                 words = f"command {answer.command_id} acknowledged at sample {at}"
                 self.add(block.start_s, "decision", words)
+            else:
+                self._refusal = {"command_id": answer.command_id, "reason": answer.reason}
+                words = f"command {answer.command_id} refused by the rig: {answer.reason}"
+                self.add(block.start_s, "warning", words)
             if self._sent is not None and self._sent["command_id"] == answer.command_id:
                 state = "acknowledged" if answer.accepted else "refused"
                 self._sent = {**self._sent, "state": state, "at_sample": at, "reason": answer.reason}

@@ -206,6 +206,9 @@ function followOff(s) {
     emergency(`✓ Control is off; the rig confirms it (command ${offSent.command}).`, "good");
     offSent = null;
     confirmed = true;
+  } else if (s.refusal?.command_id === offSent.command) {
+    emergency(`The rig refused to switch control off: ${s.refusal.reason}. Use the switch at the rig.`, "bad");
+    offSent = null;
   } else if (late_s > 1.5) emergency(`Control off was sent ${Math.round(late_s)} s ago and the rig has not confirmed it. Use the switch at the rig.`, "bad");
   else emergency(`Control off sent (command ${offSent.command}); waiting for the rig …`, "warn");
 }
