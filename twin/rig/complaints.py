@@ -2,6 +2,8 @@
 
 from collections import deque
 
+from pydantic import ValidationError
+
 FIRST = 5
 """Of each reason so many are told; after that the tenth, hundredth, thousandth and so on."""
 
@@ -12,6 +14,12 @@ def plain(text: object, most: int = 200) -> str:
     """Text from a stranger, fit for a log: of bounded length, printable, and valid Unicode."""
     cut = str(text)[:most].encode("utf-8", "replace").decode("utf-8")
     return "".join(c if c.isprintable() else "?" for c in cut)
+
+
+def first_problem(error: ValidationError) -> str:
+    """Say where a message is wrong, and how."""
+    problem = error.errors()[0]
+    return f"{'.'.join(str(part) for part in problem['loc']) or 'message'}: {problem['msg']}"
 
 
 class Complaints:

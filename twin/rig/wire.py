@@ -16,6 +16,7 @@ TOPIC_HELLO = b"hello"
 TOPIC_SAMPLES = b"samples"
 TOPIC_END = b"end"
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
+MAX_SAMPLE = 2**62
 ANOTHER_STATION = "another station has the controls"
 
 
