@@ -465,6 +465,11 @@ def test_page_opens_from_disk_reads_out_values_and_prints(
         page.wait_for_function("document.querySelector('.plot output').textContent.includes(': ')")
         plot.focus()
         page.keyboard.press("ArrowRight")
+        inside, box = (plot.locator(what).bounding_box() for what in ("output", "svg"))
+        assert inside is not None
+        assert box is not None
+        assert box["y"] <= inside["y"] < inside["y"] + inside["height"] <= box["y"] + box["height"]
+        assert box["x"] <= inside["x"] < inside["x"] + inside["width"] <= box["x"] + box["width"]
         first = plot.locator("output").inner_text()
         page.keyboard.press("ArrowLeft")
         assert plot.locator("output").inner_text() != first or name == "comparison"  # a dwell has one cell

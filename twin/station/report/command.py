@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from twin.plant.errors import InputError
 from twin.station.confirm import YesOption, accept_recording
@@ -108,7 +108,7 @@ def report_table(said: dict[str, Any]) -> Table:
     v, h, f = said["verify"], said["hindsight"], said["figures"]
     whole = {True: "whole", False: "[red]not whole[/]", None: "no checksums"}[v["whole"]]
     table = Table(
-        "figure", "limit", "worst seen", "when", "margin", "verdict",
+        Column("figure", overflow="fold"), "limit", "worst seen", "when", "margin", "verdict",
         title=f"{escape(said['setup']['file'])}: {said['setup']['plant']}, {said['setup']['seconds']:.1f} s, {whole}",
         title_justify="left",
     )  # fmt: skip

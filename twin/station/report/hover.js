@@ -23,10 +23,12 @@ for (const plot of document.querySelectorAll('.plot')) {
       for (const [n, v] of Object.entries({cx: left + w * place(s.x[k], a.x, a.log[0]), cy: y, r: 2.6, fill: '#1c2529'})) dot.setAttribute(n, v);
     }
     out.textContent = rows.length ? a.name + ' ' + Number(x.toPrecision(5)) + '\n' + rows.join('\n') : '';
-    const scale = svg.clientWidth / svg.viewBox.baseVal.width, right = px > left + w / 2;
-    out.style.top = (top * scale + svg.offsetTop + 6) + 'px';
-    out.style.left = right ? '' : (px * scale + 12) + 'px';
-    out.style.right = right ? (plot.clientWidth - px * scale + 12) + 'px' : '';
+    const drawn = svg.getBoundingClientRect(), around = plot.getBoundingClientRect();
+    const scale = drawn.width / svg.viewBox.baseVal.width, right = px > left + w / 2;
+    const at = drawn.left - around.left + px * scale;
+    out.style.top = (drawn.top - around.top + top * scale + 6) + 'px';
+    out.style.left = right ? 'auto' : (at + 12) + 'px';
+    out.style.right = right ? (around.width - at + 12) + 'px' : 'auto';
   };
   svg.addEventListener('pointermove', e => {
     const r = svg.getBoundingClientRect(), v = svg.viewBox.baseVal;

@@ -5,20 +5,29 @@ import hashlib
 import json
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from twin.plant.errors import InputError
 from twin.station.opened import Opened
 
+if TYPE_CHECKING:
+    from twin.rig.recorded import Recording
+
 _PIECE = 1 << 20
 
 
-def origin(path: Path, opened: Opened) -> dict[str, Any]:
+def origin(path: Path, opened: Opened, progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Facts of a recording's files, for people and programs.
+
+    Parameters
+    ----------
+    progress
+        Takes bytes read and bytes in all.
 
     Returns
     -------
@@ -32,21 +41,21 @@ def origin(path: Path, opened: Opened) -> dict[str, Any]:
     InputError
         If a file can no longer be read.
     """
-    own = is_own(path)
+    recording = _recording(path)
     config = _object(opened.config_json)
     facts: dict[str, Any] = {
-        "own": own,
+        "own": recording is not None,
         "seed": opened.seed,
         "config": config,
         "law": _law(config),
         "plant_fingerprint": opened.plant.fingerprint,
         "remarks": list(opened.remarks),
     }
-    if own:
-        return facts | _own(path)
+    if recording is not None:
+        return facts | _own(path, recording, progress)
     changed = datetime.fromtimestamp(path.stat().st_mtime, UTC)
     return facts | {
-        "files": [_file(path)],
+        "files": _files([path], progress),
         "recorded_at": changed.isoformat(timespec="seconds"),
         "date_from": "when the file was last written; the recording itself does not say",
         "verify": {"whole": None, "damage": [], "gaps": [], "masked_samples": None, "blocks": None},
@@ -58,22 +67,23 @@ def origin(path: Path, opened: Opened) -> dict[str, Any]:
 
 def is_own(path: Path) -> bool:
     """Whether this program's recorder made a file, or may have: of other programs there are .rrd files, too."""
+    return _recording(path) is not None
+
+
+def _recording(path: Path) -> "Recording | None":
     from twin.rig.recorded import open_recording
 
     if not path.is_dir() and path.suffix.lower() != ".rrd":
-        return False
+        return None
     try:
-        open_recording(path)
+        return open_recording(path)
     except InputError:
-        return False
-    return True
+        return None
 
 
-def _own(path: Path) -> dict[str, Any]:
-    from twin.rig.recorded import open_recording
+def _own(path: Path, recording: "Recording", progress: Callable[[int, int], None]) -> dict[str, Any]:
     from twin.station.library import inspect
 
-    recording = open_recording(path)
     found = inspect(path)
     damage = list(found.damage)
     if recording.missing_parts:
@@ -82,7 +92,7 @@ def _own(path: Path) -> dict[str, Any]:
         damage.append("its recorder did not finish it: it was killed, or is still recording")
     started = _started(recording.source)
     return {
-        "files": [_file(part) for part in recording.parts],
+        "files": _files(recording.parts, progress),
         "recorded_at": started,
         "date_from": "the recorder's clock when the recording was begun"
         if started
@@ -100,15 +110,21 @@ def _own(path: Path) -> dict[str, Any]:
     }
 
 
-def _file(path: Path) -> dict[str, Any]:
-    digest = hashlib.sha256()
+def _files(paths: Sequence[Path], progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
     try:
-        with path.open("rb") as file:
-            while piece := file.read(_PIECE):
-                digest.update(piece)
-        return {"name": path.name, "bytes": path.stat().st_size, "sha256": digest.hexdigest()}
+        sizes = [path.stat().st_size for path in paths]
+        done, out = 0, []
+        for path, n_bytes in zip(paths, sizes, strict=True):
+            digest = hashlib.sha256()
+            with path.open("rb") as file:
+                while piece := file.read(_PIECE):
+                    digest.update(piece)
+                    done += len(piece)
+                    progress(done, sum(sizes))
+            out.append({"name": path.name, "bytes": n_bytes, "sha256": digest.hexdigest()})
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    return out
 
 
 def _started(path: Path) -> str | None:

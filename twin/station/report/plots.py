@@ -32,7 +32,7 @@ def plots_of(run: Replayed) -> list[Plot]:
     if _any(run.hindsight.attenuation):
         caption = (
             "Of settled blocks, against the model without control with the damping known in the end; bars are one "
-            "standard deviation, by the block's noise and the damping's. 0 dB is no effect."
+            "standard deviation, by the block's noise and the damping's. 0 dB is no effect; nothing is drawn below -60."
         )
         found.append(
             Plot("attenuation", "Attenuation against frequency", caption, 3.4, lambda f: _attenuation(f, run))
@@ -99,7 +99,7 @@ def _motion_caption(run: Replayed) -> str:
     if _any(run.tracks["displacement_m"]):
         return (
             f"Peak displacement of {name} at the excitation, block by block; without control as the model has it with "
-            "the damping known in the end. Shaded: the controller acts."
+            "the damping known in the end; nothing is drawn below 10 nm. Shaded: the controller acts."
         )
     return f"Largest displacement of {name} in each block, as the observer estimates it: no excitation is tracked."
 

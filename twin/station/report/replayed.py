@@ -83,7 +83,7 @@ def replayed(
     say
         Takes lines for the person.
     progress
-        Takes samples done and samples in all.
+        Takes what is done and all there is: bytes of the files, then samples.
 
     Raises
     ------
@@ -91,7 +91,8 @@ def replayed(
         If the recording cannot be used, or holds no block.
     """
     opened = open_any(path, options)
-    came_from = origin(path, opened)
+    update = _not_too_often(progress)
+    came_from = origin(path, opened, update)
     log, history = TrackLog(opened.plant, opened.channels), History()
     latest: dict[str, Any] = {"curve": None, "schedule": None, "kind": None}
 
@@ -104,7 +105,7 @@ def replayed(
             latest["kind"] = session.retuning.goal.budget_kind
 
     began = time.perf_counter()
-    figures = run_replay(path, options, say, _not_too_often(progress), watch=watch, opened=opened)
+    figures = run_replay(path, options, say, update, watch=watch, opened=opened)
     tracks = log.tracks()
     if not len(tracks):
         raise InputError(f"{path}: holds no whole block; there is nothing to report")
