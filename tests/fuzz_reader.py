@@ -1,6 +1,7 @@
 """Reads damaged copies of a recording, in a process of its own: native code may crash, and memory is limited.
 
-``python fuzz_reader.py KIND FOLDER SEED CASES``; a line of JSON for each case: how it was damaged, and what came of it.
+``python fuzz_reader.py FOLDER SEED CASES KIND ...``; a line of JSON before each case, with how the file was damaged,
+and one after it, with what came of it.
 """
 
 import faulthandler
@@ -9,7 +10,7 @@ import resource
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from twin.rig.recorded import open_recording
 from twin.station.library import inspect
 
 OWN = "own"
+SLOW = ("hdf5", "mat v7.3")  # each looked at in a process of its own
 MORE_MEMORY = 1 << 30
 SECONDS = 40
 TELLING = (
@@ -40,7 +42,9 @@ TELLING = (
 )
 
 
-def damaged(whole: bytes, rng: np.random.Generator, cases: int) -> Iterator[tuple[str, bytes]]:
+def damaged(
+    whole: bytes, rng: np.random.Generator, cases: int, *, few: bool = False
+) -> Iterator[tuple[str, bytes]]:
     """Copies cut short, with bytes changed, with absurd numbers in, with parts doubled, lost, swapped."""
     size = len(whole)
     steps = {
@@ -48,7 +52,7 @@ def damaged(whole: bytes, rng: np.random.Generator, cases: int) -> Iterator[tupl
         *(size - k for k in range(1, 40, 6)),
         *(k for k in range(0, size, max(1, size // 12))),
     }
-    for at in sorted(k for k in steps if 0 <= k < size):
+    for at in sorted(k for k in steps if 0 <= k < size)[:: 5 if few else 1]:
         yield f"cut at {at}", whole[:at]
     for _ in range(cases):
         way = rng.integers(0, 6)
@@ -130,27 +134,34 @@ def outcome_of_own(path: Path) -> str:
     return "read"
 
 
-def main(kind: str, folder: Path, seed: int, cases: int) -> None:
-    """Write the file, then read so many damaged copies of it."""
+def main(kinds: list[str], folder: Path, seed: int, cases: int) -> None:
+    """Of each kind write the file, then read so many damaged copies of it."""
     from test_archives import FORMATS, FS, PLANT
 
     warnings.simplefilter("ignore")
     faulthandler.enable()
-    path = own_recording(folder) if kind == OWN else FORMATS[kind](folder)
-    whole = path.read_bytes()
-    attempt = partial(outcome_of_own, path) if kind == OWN else partial(outcome, path, PLANT, FS)
-    assert attempt() == "read"  # also brings in what is only imported then
+    attempts: dict[str, tuple[Path, Callable[[], str]]] = {}
+    for k, kind in enumerate(kinds):
+        home = folder / str(k)
+        home.mkdir()
+        path = own_recording(home) if kind == OWN else FORMATS[kind](home)
+        attempt = partial(outcome_of_own, path) if kind == OWN else partial(outcome, path, PLANT, FS)
+        assert attempt() == "read"  # also brings in what is only imported then
+        attempts[kind] = path, attempt
     limit = psutil.Process().memory_info().vms + MORE_MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    for how, content in damaged(whole, np.random.default_rng(seed), cases):
-        path.write_bytes(content)
-        sys.stdout.write(json.dumps([how]) + "\n")
-        sys.stdout.flush()
-        signal.alarm(SECONDS)  # ends the process, also in the middle of native code
-        found = attempt()
-        signal.alarm(0)
-        sys.stdout.write(json.dumps([how, found]) + "\n")
+    for kind, (path, attempt) in attempts.items():
+        few = kind in SLOW
+        for how, content in damaged(
+            path.read_bytes(), np.random.default_rng(seed), 10 if few else cases, few=few
+        ):
+            path.write_bytes(content)
+            print(json.dumps([kind, how]), flush=True)
+            signal.alarm(SECONDS)  # ends the process, also in the middle of native code
+            found = attempt()
+            signal.alarm(0)
+            print(json.dumps([kind, how, found]), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
+    main(sys.argv[4:], Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))

@@ -1,6 +1,7 @@
 """A recording's channels written in other people's formats, a part at a time; what is missing becomes NaN."""
 
 import io
+import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -12,14 +13,16 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pyuff
-import scipy.io.wavfile
 from nptdms import ChannelObject, TdmsWriter
 
 from twin.plant.blocks import Block, Channel
 from twin.plant.errors import InputError, RunError
 from twin.plant.linear import Array
+from twin.rig.archives.base import guard_memory
 
+PART_ROWS = 1 << 18
 TABLE_TIME = "time"
+WAVE_OF_FLOATS, LONG_WAVE = 3, 0xFFFFFFFF
 
 
 class Series:
@@ -44,8 +47,10 @@ class Series:
         """First sample and (n, n_channels) values of consecutive parts; NaN where no valid sample is."""
         following: int | None = None
         for block in self._blocks():
-            if following is not None and block.first_sample > following:
-                yield following, np.full((block.first_sample - following, len(self.channels)), np.nan)
+            while following is not None and block.first_sample > following:
+                n = min(block.first_sample - following, PART_ROWS)
+                yield following, np.full((n, len(self.channels)), np.nan)
+                following += n
             yield block.first_sample, np.where(block.valid, block.values, np.nan)
             following = block.end_sample
 
@@ -124,30 +129,66 @@ def write_mat(path: Path, series: Series) -> None:
 
 
 def write_wav(path: Path, series: Series) -> None:
-    """WAV of 32-bit floats, with a sidecar for names and units; rates are whole numbers there."""
+    """WAV of floats, with a sidecar for names and units; rates are whole numbers there.
+
+    32 bits a sample where no bit is lost by it, else 64; RF64 from 4 GB on.
+    """
     rate = round(series.sample_rate_hz)
     if abs(rate - series.sample_rate_hz) > 1e-9 * rate:
         raise InputError(f"{path}: a WAV file's rate is a whole number of Hz, not {series.sample_rate_hz:g}")
-    values = np.concatenate([values for _, values in series.parts()]).astype(np.float32)
-    scipy.io.wavfile.write(path, rate, values)
-    _write_sidecar(path, series, [f"channel{k + 1}" for k in range(len(series.channels))])
+    length, short = 0, True
+    for _, values in series.parts():
+        length += len(values)
+        with np.errstate(over="ignore"):
+            short &= bool(np.array_equal(values.astype(np.float32), values, equal_nan=True))
+    width, n = (4 if short else 8), len(series.channels)
+    size = length * n * width
+    layout = struct.pack(
+        "<4sIHHIIHH", b"fmt ", 16, WAVE_OF_FLOATS, n, rate, rate * n * width, n * width, 8 * width
+    )
+    if size + 64 < LONG_WAVE:
+        head = b"RIFF" + struct.pack("<I", size + 36) + b"WAVE" + layout + b"data" + struct.pack("<I", size)
+    else:
+        lengths = struct.pack("<4sIQQQI", b"ds64", 28, size + 72, size, length, 0)
+        head = (
+            b"RF64"
+            + struct.pack("<I", LONG_WAVE)
+            + b"WAVE"
+            + lengths
+            + layout
+            + b"data"
+            + struct.pack("<I", LONG_WAVE)
+        )
+    with path.open("wb") as file:
+        file.write(head)
+        for _, values in series.parts():
+            file.write(np.ascontiguousarray(values, f"<f{width}").tobytes())
+    _write_sidecar(path, series, [f"channel{k + 1}" for k in range(n)])
 
 
 def write_uff(path: Path, series: Series) -> None:
     """Universal file, one binary dataset 58 a channel; it has no way to say that a sample is missing."""
-    values = np.concatenate([values for _, values in series.parts()])
-    if not np.all(np.isfinite(values)):
+    length = missing = 0
+    for _, values in series.parts():
+        length += len(values)
+        missing += int(values.size - np.isfinite(values).sum())
+    if missing:
         raise InputError(
-            f"{path}: {np.isnan(values).sum()} samples are missing and a universal file cannot say so; "
+            f"{path}: {missing} samples are missing and a universal file cannot say so; "
             "export a part without gaps (--from, --to), or as .tdms"
         )
+    # What writes it wants a whole channel, and a time for every sample, and takes copies of both.
+    guard_memory(
+        path, f"{length} samples of a channel", 6 * 8 * length, "export as .tdms, which is written in parts"
+    )
     path.unlink(missing_ok=True)
     file = pyuff.UFF(str(path))
     with warnings.catch_warnings(
         action="ignore", category=ResourceWarning
     ):  # it leaves its file to the collector
         for k, channel in enumerate(series.channels):
-            file.write_sets(_dataset_58(k, channel, values[:, k], series.sample_rate_hz), "add")
+            values = np.concatenate([part[:, k] for _, part in series.parts()])
+            file.write_sets(_dataset_58(k, channel, values, series.sample_rate_hz), "add")
 
 
 def _dataset_58(k: int, channel: Channel, values: Array, rate_hz: float) -> dict[str, object]:

@@ -123,7 +123,7 @@ def guard_memory(path: Path, name: str, n_bytes: int, remedy: str) -> None:
     free = free_memory()
     if n_bytes > WHOLE_SHARE * free:
         raise InputError(
-            f"{path}: {name} can only be read whole in this format, which takes {n_bytes / 1e9:.3g} GB, with "
+            f"{path}: {name} can only be had whole in this format, which takes {n_bytes / 1e9:.3g} GB, with "
             f"{free / 1e9:.3g} GB of memory free; {remedy}"
         )
 

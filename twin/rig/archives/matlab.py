@@ -97,6 +97,7 @@ class HdfArchive(Archive):
             for name, dataset in found:
                 self._refuse_to_be_led_astray(name, dataset)
         except InputError:
+            self._file.close()
             raise
         except UNREADABLE as error:
             raise InputError(f"{path}: is cut short or damaged ({error}); copy or export it again") from error

@@ -18,7 +18,7 @@ from twin.rig.units import is_common
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|")
-HEAD_LINES = 200
+HEAD_LINES, HEAD_BYTES = 200, 1 << 18
 MISSING = [
     "",
     "NaN",
@@ -159,14 +159,15 @@ class TextArchive(Archive):
         if len(rows) > 1 and all(is_common(c.strip("[]() ")) or c.strip("[]() -") == "" for c in rows[-1]):
             below = [cell.strip("[]() ") for cell in rows[-1]]
             rows = rows[:-1]
-        names = []
+        names: dict[str, None] = {}
         for k, cell in enumerate(rows[-1]):
             match = _WITH_UNIT.match(cell)
             name = (match["name"] if match else cell).strip() or f"column{k + 1}"
-            names.append(name if name not in names else f"{name}_{k + 1}")
+            name = name if name not in names else f"{name}_{k + 1}"
+            names[name] = None
             unit = match["unit"].strip() if match else below[k] if below else ""
             if unit:
-                units[names[-1]] = unit
+                units[name] = unit
         return tuple(names), units
 
 
@@ -174,9 +175,14 @@ def _head(path: Path) -> tuple[list[str], str]:
     """First lines of the file, and the encoding they are in."""
     try:
         with path.open("rb") as file:
-            start = file.read(1 << 18)
+            start = file.read(HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    if len(start) == HEAD_BYTES and b"\n" not in start and b"\r" not in start:
+        raise InputError(
+            f"{path}: its first line goes on beyond {HEAD_BYTES >> 10} kB; no recording has so many columns: export "
+            "the channels you need"
+        )
     if b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is neither a text table nor any other known format of recordings")
     encoding = "utf16" if start.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf8"
