@@ -9,6 +9,7 @@ import argparse
 import itertools
 import random
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.station_processes import Station, station
 from twin.station.doctor import find_browser
 
+GIVEN_UP_S = 10.0
 FLAGS = ["--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
 LISTEN = """() => {
   window.redraws = []; window.completes = [];
@@ -52,7 +54,10 @@ def _moves(page: Page, count: int) -> tuple[list[float], list[float]]:
         seen = page.evaluate("redraws.length")
         move()
         page.wait_for_timeout(rng.choice((60.0, 250.0, 700.0)))
+        end = time.monotonic() + GIVEN_UP_S
         while page.evaluate("redraws.length") == seen:
+            if time.monotonic() > end:
+                raise RuntimeError(f"no curves within {GIVEN_UP_S:.0f} s of a move")
             page.wait_for_timeout(50.0)
     page.wait_for_timeout(500)
     return page.evaluate("redraws"), page.evaluate("completes")

@@ -153,7 +153,7 @@ $("controls").addEventListener("input", (event) => {
   showSettings();
   if (state.what_if) redraw(event.timeStamp);
 });
-$("controls").addEventListener("reset", () => setTimeout(() => { touched = new Set(); if (state.goal) fromGoal(state.goal); if (state.what_if) redraw(); }));
+$("controls").addEventListener("reset", (event) => setTimeout(() => { touched = new Set(); if (state.goal) fromGoal(state.goal); if (state.what_if) redraw(event.timeStamp); }));
 $("branch").addEventListener("click", branch);
 $("with-passive").addEventListener("change", () => branchShown.length && showBranch(...branchShown));
 $("show-viewer").addEventListener("click", () => openViewer($("show-viewer").getAttribute("aria-expanded") !== "true"));
