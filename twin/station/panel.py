@@ -84,6 +84,7 @@ class Panel:
     _loads: deque[float] = field(default_factory=lambda: deque(maxlen=20))
     _sent: dict[str, Any] | None = None
     _refusal: dict[str, Any] | None = None
+    _acknowledged: int = 0
     _audit: AuditPoint | None = None
     _troubles: tuple[int, float] = (0, -math.inf)
 
@@ -136,6 +137,7 @@ class Panel:
             "can_revert": retuning is not None and retuning.can_revert,
             "sent": self._sent,
             "refusal": self._refusal,
+            "acknowledged": self._acknowledged,
             "audit": None if self._audit is None else audit_figures(self._audit),
             "alarms": self._alarms(frame, load, wire, goal),
             # At every start the rig has been without a station for a while: no alarm, but to be known.
@@ -218,6 +220,7 @@ class Panel:
         for answer in frame.acknowledgements:
             at = answer.applied_at_sample
             if answer.accepted:
+                self._acknowledged = max(self._acknowledged, answer.command_id)
                 words = f"command {answer.command_id} acknowledged at sample {at}"
                 self.add(block.start_s, "decision", words)
             else:

@@ -173,7 +173,7 @@ export function start() {
     offSent = null;
     try {
       const answer = await call("/api/off", {}, AbortSignal.timeout(3000));
-      offSent = { command: answer.command_id, at: performance.now(), sample: seen() };
+      offSent = { command: answer.command_id, at: performance.now() };
       unarm();
       put("said", "Control off sent.");
     } catch (error) {
@@ -202,7 +202,7 @@ function followOff(s) {
     return;
   }
   const late_s = (performance.now() - offSent.at) / 1000;
-  if (s.control_on === false && s.sample > offSent.sample) {
+  if (s.control_on === false && s.acknowledged >= offSent.command) {
     emergency(`✓ Control is off; the rig confirms it (command ${offSent.command}).`, "good");
     offSent = null;
     confirmed = true;
@@ -212,7 +212,7 @@ function followOff(s) {
   } else if (late_s > 1.5) emergency(`Control off was sent ${Math.round(late_s)} s ago and the rig has not confirmed it. Use the switch at the rig.`, "bad");
   else emergency(`Control off sent (command ${offSent.command}); waiting for the rig …`, "warn");
 }
-setInterval(() => { if (offSent !== null) followOff({ control_on: null, sample: 0 }); }, 500);
+setInterval(() => { if (offSent !== null) followOff({ control_on: null }); }, 500);
 
 export function follow(s) {
   followOff(s);
