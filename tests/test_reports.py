@@ -107,6 +107,9 @@ def test_sweeps_of_other_rates_directions_and_lengths_differ_by_what_they_differ
     assert found["mean"] == pytest.approx(5e-6, rel=0.02)
     assert found["significant"] == found["judged"] == len(c.grid)
     assert all(abs(v) < 1e-18 for v in lines["displacement_m"].differences[0].value)
+    assert as_data(c)["quantities"]["displacement_m"]["differences"][1]["relative"] == pytest.approx(
+        5.0 / 50.5, rel=0.02
+    )
 
 
 def test_by_time_blocks_of_other_lengths_meet_at_the_same_instants(case: Callable[[str], Replayed]) -> None:

@@ -99,10 +99,19 @@ def _differences(c: Comparison, said: dict[str, Any]) -> Html:
         [title, name, *words]
         for title, name, words in _difference_rows(c, said)
     ]  # fmt: skip
-    heads = ("quantity", "run", "mean difference", "largest", "at", f"beyond {SIGNIFICANT:g} σ", "cells")
+    heads = (
+        "quantity",
+        "run",
+        "mean difference",
+        "share",
+        "largest",
+        "at",
+        f"beyond {SIGNIFICANT:g} σ",
+        "cells",
+    )
     return join((
         element("h3", f"Differences from {c.runs[0].name}, cell by cell", class_="sub"),
-        table(heads, rows, (2, 3, 4, 5, 6)) if rows else element("p", "Nothing is known of both runs at any place."),
+        table(heads, rows, (2, 3, 4, 5, 6, 7)) if rows else element("p", "Nothing is known of both runs at any place."),
     ))  # fmt: skip
 
 
@@ -123,6 +132,9 @@ def _difference_rows(c: Comparison, said: dict[str, Any]) -> Iterable[tuple[str,
                 c.runs[k].name,
                 [
                     value_of(s["mean"], unit_shown, s["mean_std"]),
+                    ""
+                    if differences[k].get("relative") is None
+                    else f"{100.0 * differences[k]['relative']:+.1f} %",
                     value_of(s["worst"], unit_shown, s["worst_std"]),
                     place,
                     beyond,
@@ -275,7 +287,7 @@ def comparison_tables(c: Comparison, said: dict[str, Any]) -> Group:
         first.add_row(row["title"], *_beside(row))
     unit = "Hz" if c.by == "frequency" else "s"
     second = Table(
-        "quantity", "run", "mean difference", "largest", "at", f"beyond {SIGNIFICANT:g} σ", "cells",
+        "quantity", "run", "mean difference", "share", "largest", "at", f"beyond {SIGNIFICANT:g} σ", "cells",
         title=f"Cell by cell, {c.grid[0]:g} to {c.grid[-1]:g} {unit}", title_justify="left",
     )  # fmt: skip
     for title, name, words in _difference_rows(c, said):

@@ -24,6 +24,9 @@ SIGNIFICANT = 2.0
 KNOWN_NS_M = 1.0
 """Damping counts as known where its standard deviation is below this, in both runs."""
 
+RATIOS = ("m", "W", "A")
+"""Units of quantities whose differences are told as shares of the reference, too."""
+
 SAME = 1e-9
 """Share of the reference below which a difference is rounding."""
 
@@ -222,9 +225,18 @@ def _line(c: Comparison, line: Line) -> dict[str, Any]:
         "unit": line.quantity.unit,
         "runs": [{"value": k.value, "std": k.std, "blocks": k.blocks} for k in line.cells],
         "differences": [
-            {"value": d.value, "std": d.std, "summary": d.summary(c.grid)} for d in line.differences
+            {"value": d.value, "std": d.std, "summary": d.summary(c.grid), "relative": _relative(line, d)}
+            for d in line.differences
         ],
     }
+
+
+def _relative(line: Line, difference: Difference) -> float | None:
+    """Mean difference over the reference's mean in the same cells; None for what has no size of its own."""
+    known, reference = np.isfinite(difference.value), line.cells[0].value
+    if line.quantity.unit not in RATIOS or not known.any() or not reference[known].mean() > 0.0:
+        return None
+    return float(difference.value[known].mean() / reference[known].mean())
 
 
 def _damping_data(c: Comparison) -> dict[str, Any] | None:
