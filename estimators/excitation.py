@@ -247,9 +247,15 @@ class _Course:
         self.phase += math.tau * (self.frequency + 0.5 * self.rate * d) * d
         self.phase = math.remainder(self.phase, math.tau)
         self.frequency += self.rate * d
-        step = np.array([[1.0, d], [0.0, 1.0]])
-        walk = RATE_WALK_HZ_S**2 * np.array([[d**3 / 3.0, 0.5 * d**2], [0.5 * d**2, d]])
-        self._variance = step @ self._variance @ step.T + walk
+        # [1 d; 0 1] V [1 0; d 1] and the walk's covariance, written out.
+        V, walk = self._variance, RATE_WALK_HZ_S**2
+        both = V[0, 1] + d * V[1, 1]
+        self._variance = np.array(
+            [
+                [V[0, 0] + d * V[0, 1] + d * both + walk * d**3 / 3.0, both + walk * 0.5 * d**2],
+                [both + walk * 0.5 * d**2, V[1, 1] + walk * d],
+            ]
+        )
 
     def correct(self, frequency_hz: float, std_hz: float, one_tone: bool) -> bool:
         """Take a block's frequency in; returns whether it lies on the course so far.
