@@ -349,6 +349,20 @@ def test_report_of_a_file_that_was_cut_short_says_so_first_and_lies_beside_it(cu
     assert said["figures"]["blocks"] == said["verify"]["blocks"]
 
 
+def test_report_of_a_file_with_a_damaged_block_holds_what_lies_before_it(tmp_path: Path) -> None:
+    damaged, figures = tmp_path / "damaged.rrd", tmp_path / "figures.json"
+    content = bytearray((LIBRARY / "whatif_budget_change" / "recording.rrd").read_bytes())
+    for k in range(40):
+        content[len(content) // 2 + k] ^= 0x5A
+    damaged.write_bytes(content)
+    done = invoke("report", damaged, "--json", figures)
+    assert done.exit_code == 0, done.output
+    said = json.loads(figures.read_text())
+    assert said["verify"]["whole"] is False
+    assert "damaged" in said["verify"]["damage"][0]
+    assert 10 < said["figures"]["blocks"] == said["verify"]["blocks"] < 40
+
+
 def test_foreign_recording_is_reported_with_what_can_be_said(realdata: Path, tmp_path: Path) -> None:
     page, figures = tmp_path / "beam.html", tmp_path / "beam.json"
     done = CliRunner().invoke(

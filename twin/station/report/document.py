@@ -135,6 +135,8 @@ def cannot_say(run: Replayed) -> list[str]:
         told.append(
             "Whether the file is as it was recorded: its format has no checksums. The SHA-256 above says what was read."
         )
+    if run.origin["verify"]["damage"]:
+        told.append("What follows where the recording is damaged or cut: it is in none of these figures.")
     if not t.reference and not t.force_estimated:
         told.append(
             "Motion, attenuation and power at the excitation: the plant and its channels show none "

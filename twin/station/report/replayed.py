@@ -1,8 +1,9 @@
 """A recording taken once through the session, with everything that reports and comparisons say of it."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import numpy as np
 from estimators.types import DampingCurve
 from tuning.types import BudgetKind
 from twin.control.schedule import GainSchedule
+from twin.plant.blocks import Block
 from twin.plant.config import Plant
 from twin.plant.errors import InputError
 from twin.station.frame import Frame
-from twin.station.opened import ReplayOptions, open_any
+from twin.station.opened import BlockSource, ReplayOptions, open_any
 from twin.station.replay import run_replay
 from twin.station.report.history import History
 from twin.station.report.limits import Judged, judge
@@ -88,11 +90,13 @@ def replayed(
     Raises
     ------
     InputError
-        If the recording cannot be used, or holds no block.
+        If the recording cannot be used, or holds no whole block.
     """
     opened = open_any(path, options)
     update = _not_too_often(progress)
     came_from = origin(path, opened, update)
+    if came_from["verify"]["damage"]:
+        opened = replace(opened, blocks=_until_damage(opened.blocks))
     log, history = TrackLog(opened.plant, opened.channels), History()
     latest: dict[str, Any] = {"curve": None, "schedule": None, "kind": None}
 
@@ -145,6 +149,16 @@ def _estimates(figures: dict[str, Any], known: Any) -> str:
     return f"{computed} The tuner's answers were worked out again: {n}; taken from the recording: " + (
         f"{max(0, len(known) - n)}." if len(known) else "none (another program, or asked to)."
     )
+
+
+def _until_damage(blocks: BlockSource) -> BlockSource:
+    """Blocks before the first that cannot be read; that there are no more is for the report to say."""
+
+    def whole(from_sample: int = 0) -> Iterator[Block]:
+        with suppress(InputError):
+            yield from blocks(from_sample)
+
+    return whole
 
 
 def _not_too_often(progress: Callable[[int, int], None]) -> Callable[[int, int], None]:
