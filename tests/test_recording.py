@@ -432,7 +432,7 @@ def test_a_block_that_says_another_sample_than_its_time_is_found(
         recorder.write_block(a_block(500))
     blocks = open_recording(path).blocks()
     assert_same_block(a_block(0), next(blocks))
-    with pytest.raises(InputError, match="sample 500 .* is damaged"):
+    with pytest.raises(InputError, match=r"sample 500 .* is damaged"):
         next(blocks)
 
 
@@ -549,6 +549,43 @@ def test_a_disk_that_is_slow_to_confirm_costs_no_block(
     read = open_recording(path)
     assert read.finished
     assert read.n_blocks == 2
+
+
+OUT_OF_ROOM = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_recording import RunError, a_block, a_recorder
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # as a quota, or a disk that is full
+recorder = a_recorder(Path(sys.argv[1]))
+try:
+    for k in range(200):
+        recorder.write_block(a_block(k * 500))
+        print(k + 1, flush=True)
+    raise SystemExit("it should have been told")
+except RunError as error:
+    print(error)
+try:
+    recorder.close()
+except RunError:
+    print("told again")
+"""
+
+
+def test_a_file_that_may_grow_no_further_costs_the_last_block_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    command = [sys.executable, "-c", OUT_OF_ROOM, str(path), str(Path(__file__).parent)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    *counts, said, again = done.stdout.splitlines()
+    assert "recording stopped" in said
+    assert "What was recorded until then can be read" in said
+    assert again == "told again"
+    recording = open_recording(path)
+    read = list(recording.blocks())
+    # The block in hand, and one that was taken while the disk said no.
+    assert len(counts) - 1 <= len(read) <= len(counts)
+    for k, block in enumerate(read):
+        assert_same_block(a_block(k * 500), block)
 
 
 WITHOUT_PIPES = """

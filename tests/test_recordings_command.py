@@ -174,6 +174,35 @@ def test_what_is_exported_reads_back_the_same_in_every_format(
     again.close()
 
 
+@pytest.mark.parametrize("ending", WRITERS)
+def test_every_bit_of_64_bit_samples_survives_every_format(tmp_path: Path, ending: str) -> None:
+    path, out = tmp_path / "one.rrd", tmp_path / f"copy{ending}"
+    values = np.random.default_rng(3).standard_normal((2000, len(CHANNELS))) * np.pi
+    with Recorder(
+        path, plant=PLANT, sample_rate_hz=FS, channels=CHANNELS, run_config_json="{}", seed=None
+    ) as recorder:
+        for k in range(4):
+            recorder.write_block(make_block(500 * k, FS, values[500 * k : 500 * k + 500], CHANNELS))
+    run("export", path, "--out", out)
+    again = open_foreign(out, PLANT)
+    columns = [[c.name for c in again.channels].index(c.name) for c in CHANNELS]
+    np.testing.assert_array_equal(again.values[:, columns], values)
+    assert again.sample_rate_hz == pytest.approx(FS, rel=1e-9)
+    assert again.guesses == ()  # names, units and rate all travel with it
+    again.close()
+
+
+def test_wave_files_beyond_what_their_head_can_say_are_written_in_the_long_form(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short, long = tmp_path / "short.wav", tmp_path / "long.wav"
+    run("export", recording, "--out", short)
+    monkeypatch.setattr("twin.rig.writers.LONGEST_WAVE", 1000)
+    run("export", recording, "--out", long)
+    assert (short.read_bytes()[:4], long.read_bytes()[:4]) == (b"RIFF", b"RF64")
+    np.testing.assert_array_equal(open_foreign(short, PLANT).values, open_foreign(long, PLANT).values)
+
+
 def test_part_of_a_recording_is_exported_and_never_over_another_file(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "part.csv"
     run("export", recording, "--out", out, "--from", 0.15, "--to", 0.35)

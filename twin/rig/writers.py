@@ -22,7 +22,7 @@ from twin.rig.archives.base import guard_memory
 
 PART_ROWS = 1 << 18
 TABLE_TIME = "time"
-WAVE_OF_FLOATS, LONG_WAVE = 3, 0xFFFFFFFF
+WAVE_OF_FLOATS, LONG_WAVE, LONGEST_WAVE = 3, 0xFFFFFFFF, 0xFFFFFFFF - 64
 
 
 class Series:
@@ -146,7 +146,7 @@ def write_wav(path: Path, series: Series) -> None:
     layout = struct.pack(
         "<4sIHHIIHH", b"fmt ", 16, WAVE_OF_FLOATS, n, rate, rate * n * width, n * width, 8 * width
     )
-    if size + 64 < LONG_WAVE:
+    if size < LONGEST_WAVE:
         head = b"RIFF" + struct.pack("<I", size + 36) + b"WAVE" + layout + b"data" + struct.pack("<I", size)
     else:
         lengths = struct.pack("<4sIQQQI", b"ds64", 28, size + 72, size, length, 0)
