@@ -22,7 +22,7 @@ export function showStatus(s) {
   else chip("s-rig", silent ? `silent for ${Math.round(s.silent_s)} s` : "connected", silent ? "bad" : "good");
   chip("s-control", s.control_on === null ? "not told" : s.control_on ? "on" : "off", s.control_on ? "good" : s.read_only ? "" : "warn");
   const p = s.performance;
-  chip("s-motion", p && p.displacement_m !== null ? `${micro(p.displacement_m)} µm at ${number(s.excitation_hz, 4)} Hz` : "–", "",
+  chip("s-motion", p && p.displacement_m !== null ? `${micro(p.displacement_m)} µm, ${number(s.excitation_hz, 4)} Hz` : "–", "",
     p ? `peak; without control ${micro(p.passive_m)} µm, the least any linear controller could reach ${micro(p.limit_m)} µm` : "no excitation is tracked");
   const over = p && p.power_w > 1.15 * s.goal.budget_w;
   chip("s-power", p && p.power_w !== null ? `${watts(p.power_w)} / ${number(s.goal.budget_w)} W` : "–", p ? (over ? "bad" : "good") : "",
