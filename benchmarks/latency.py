@@ -42,37 +42,32 @@ def run_latency(setting: Setting) -> Report:
         redraws, completes = (
             ([], []) if browser_path is None else move_latencies(both, browser_path, setting.moves)
         )
-    return _report(setting, redraws, completes, obeyed)
+    return _report(redraws, completes, obeyed)
 
 
-def _report(
-    setting: Setting, redraws: list[float], completes: list[float], obeyed: dict[str, list[float]]
-) -> Report:
+def _report(redraws: list[float], completes: list[float], obeyed: dict[str, list[float]]) -> Report:
+    redrawn, confirmed = _percentiles(redraws), _percentiles(completes)
     orders = [ms for values in obeyed.values() for ms in values]
+    taken = _percentiles(orders)
     figures = {
         "moves": len(redraws),
-        "redrawn_ms": _percentiles(redraws),
-        "confirmed_ms": _percentiles(completes),
+        "redrawn_ms": redrawn,
+        "confirmed_ms": confirmed,
         "orders": len(orders),
-        "obeyed_ms": _percentiles(orders),
+        "obeyed_ms": taken,
         "obeyed_by_kind_ms": {kind: _percentiles(values) for kind, values in obeyed.items()},
     }
     rows = []
-    if redraws:
-        late = figures["redrawn_ms"]["p95"]
-        rows += [
-            Row("control moved to all curves drawn, median", figures["redrawn_ms"]["p50"], "ms"),
-            Row("  95th percentile", late, "ms", WANTED_REDRAW_MS, "less"),
-        ]
-    if completes:
-        rows.append(
-            Row("  until the whole search has confirmed them, median", _percentiles(completes)["p50"], "ms")
-        )
-    if orders:
-        rows += [
-            Row("order to first sample that obeys it, median", figures["obeyed_ms"]["p50"], "ms"),
-            Row("  95th percentile", figures["obeyed_ms"]["p95"], "ms", WANTED_OBEYED_MS, "less"),
-        ]
+    for what, found, wanted in (
+        ("control moved to all curves drawn", redrawn, WANTED_REDRAW_MS),
+        ("control left alone to curves confirmed", confirmed, None),
+        ("order to the first sample that obeys it", taken, WANTED_OBEYED_MS),
+    ):
+        if found is not None:
+            rows += [
+                Row(f"{what}, median", found["p50"], "ms"),
+                Row("  95th percentile", found["p95"], "ms", wanted, "less"),
+            ]
     return Report({"latency": figures}, rows)
 
 

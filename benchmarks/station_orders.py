@@ -22,7 +22,7 @@ from twin.rig.messages import SamplesHeader
 from twin.rig.wire import TOPIC_SAMPLES, guard_client
 
 GIVEN_UP_S, START_S = 5.0, 60.0
-SAMPLE_RATE_HZ = 50_000.0
+SAMPLE_RATE_HZ, QUIET_S = 50_000.0, 1.0
 BUDGETS_W = (0.5, 0.8, 0.4, 1.0)
 """So little that gains must change."""
 
@@ -35,6 +35,7 @@ def order_latencies(both: Station, count: int) -> dict[str, list[float]]:
     operator.wait_until_followed()
     with closing(_Blocks(both)) as blocks:
         blocks.start()
+        blocks.heard.wait(START_S)
         for k in range(count):
             kind = tuple(out)[k % len(out)]
             press = _armed(operator, BUDGETS_W[k // len(out) % len(BUDGETS_W)]) if kind == "send" else None
@@ -48,7 +49,7 @@ def order_latencies(both: Station, count: int) -> dict[str, list[float]]:
             else:
                 operator.post(f"/api/{kind}", seen_sample=seen)
             out[kind].append(1e3 * (blocks.next_after(known, kind) - began))
-            time.sleep(0.5)  # further steps of the same order
+            blocks.wait_until_quiet()
     return out
 
 
@@ -67,6 +68,8 @@ class _Blocks(threading.Thread):
     ----------
     obeyed_s
         By number of the command: when the first sample that obeys it was taken, by this machine's clock.
+    heard
+        Set with the first block.
     """
 
     def __init__(self, both: Station) -> None:
@@ -75,7 +78,7 @@ class _Blocks(threading.Thread):
         self._address = f"tcp://127.0.0.1:{both.port}"
         self._keys = load_pair(both.folder / "station.key_secret")
         self._rig = load_public(both.folder / "rig.key")
-        self._over = threading.Event()
+        self._over, self.heard = threading.Event(), threading.Event()
         self._rate_hz = SAMPLE_RATE_HZ
 
     def run(self) -> None:
@@ -89,6 +92,7 @@ class _Blocks(threading.Thread):
                     continue
                 _, header, _ = socket.recv_multipart()
                 arrived = time.monotonic()
+                self.heard.set()
                 block = SamplesHeader.model_validate_json(header)
                 for number in block.commands_applied:
                     self.obeyed_s[number] = arrived - block.n_samples / self._rate_hz
@@ -102,6 +106,11 @@ class _Blocks(threading.Thread):
                 return self.obeyed_s[new[0]]
             time.sleep(0.005)
         raise RuntimeError(f"{kind}: the rig obeyed nothing within {GIVEN_UP_S:.0f} s")
+
+    def wait_until_quiet(self) -> None:
+        """Until no further step of an order has taken effect for a while."""
+        while time.monotonic() - max(self.obeyed_s.values()) < QUIET_S:
+            time.sleep(0.05)
 
     def close(self) -> None:
         """End."""

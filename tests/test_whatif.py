@@ -197,6 +197,25 @@ def test_page_gets_all_curves_at_once_then_each_point_confirmed_until_a_newer_qu
         next(parts)
 
 
+def test_first_curves_do_not_wait_for_a_model_that_moved_on_a_little_and_say_so() -> None:
+    absorber = TEST_3.true_plant.absorber
+    assert absorber is not None
+
+    def asked(damping_ns_m: float) -> Asked:
+        plant = TEST_3.true_plant.with_damping(absorber.name, damping_ns_m)
+        return Asked("curves", Base(plant, FACTS, TEST_3.schedule, GOAL, 4.0, 0.05), Changes(), tuple(BAND))
+
+    _ours, theirs = multiprocessing.Pipe()
+    worker = _Worker(theirs)
+    list(worker.answer(asked(9.0)))
+    first, *rest = worker.answer(asked(9.2))
+    assert {(p.damping_ns_m, p.provisional) for p in first.points} == {(9.0, True)}
+    assert {(p.damping_ns_m, p.provisional) for _, p in rest} == {(9.2, False)}
+    assert len(rest) == len(BAND)
+    far, *_ = worker.answer(asked(11.0))
+    assert {p.damping_ns_m for p in far.points} == {11.0}
+
+
 def test_coarse_to_fine_is_every_point_once_and_both_ends_first() -> None:
     for n in (1, 2, 5, 11, 16):
         order = coarse_to_fine(n)

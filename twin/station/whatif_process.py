@@ -13,7 +13,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, Literal
@@ -29,8 +29,14 @@ from twin.plant.config import Plant
 from twin.plant.errors import InputError, RunError
 
 ANSWER_TIMEOUT_S = 60.0
+MOST_RESTARTS = 20
+"""A process that dies as often has a reason; without it there is no what-if, and everything else."""
+
 LONGEST_STEP = 0.5
 """Share of the absorber's stiffness that gains may move at once, as when retuning."""
+
+STALE = 5.0
+"""So many times as far as what looks the same the model may have moved on for the first curves of an answer."""
 
 BRANCH_STEP = 50
 
@@ -46,16 +52,16 @@ class Base:
     amplitude: float
     damping_std_ns_m: float
 
-    def is_like(self, other: "Base") -> bool:
-        """Whether curves of the one would look the same as those of the other."""
+    def is_like(self, other: "Base", times: float = 1.0) -> bool:
+        """Whether curves of the one would look the same as those of the other, or how many times as far off."""
         ours, theirs = self.plant.absorber, other.plant.absorber
         if ours is None or theirs is None or (self.schedule, self.goal) != (other.schedule, other.goal):
             return False
         moved = max(abs(ours.damping_at(f) - theirs.damping_at(f)) for f in self.schedule.frequency_hz)
         return (
-            moved < 0.05
-            and abs(self.amplitude / other.amplitude - 1.0) < 0.02
-            and abs(self.damping_std_ns_m - other.damping_std_ns_m) < 0.1
+            moved < 0.05 * times
+            and abs(self.amplitude / other.amplitude - 1.0) < 0.02 * times
+            and abs(self.damping_std_ns_m - other.damping_std_ns_m) < 0.1 * times
         )
 
 
@@ -79,7 +85,7 @@ class WhatIfProcess:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._number = 0
+        self._number = self._restarts = 0
         self._waiting: dict[int, queue.SimpleQueue[tuple[str, Any]]] = {}
         self._process: SpawnProcess | None = None
         self._connection: Connection[Any, Any] | None = None
@@ -160,7 +166,11 @@ class WhatIfProcess:
         except (EOFError, OSError, TypeError):
             with self._lock:
                 if self._connection is connection:  # it died, and was not ended
-                    self._start()
+                    self._restarts += 1
+                    if self._restarts <= MOST_RESTARTS:
+                        self._start()
+                    else:
+                        self.close()
             for parts in list(self._waiting.values()):
                 parts.put(("failed", "what-if had to be started anew; ask again"))
 
@@ -204,9 +214,17 @@ class _Worker:
                 yield self._branches(asked)
 
     def _curves(self, asked: Asked) -> Iterator[Any]:
-        what_if, band = self._for(asked.base), asked.frequencies_hz
-        quick = what_if.curves(band, asked.changes, quick=True)
+        band = asked.frequencies_hz
+        # A model that has moved on a little is built anew behind the first curves, all provisional then.
+        known = self._base
+        stale = known is not None and not asked.base.is_like(known) and asked.base.is_like(known, STALE)
+        at_hand = self._what_if if stale and self._what_if is not None else self._for(asked.base)
+        quick = at_hand.curves(band, asked.changes, quick=True)
+        if stale:
+            quick = replace(quick, points=tuple(replace(p, provisional=True) for p in quick.points))
         yield quick
+        self._go_on()
+        what_if = self._for(asked.base)
         # Holes first: points without gains next to the last ones may have some elsewhere.
         open_points = [k for k in coarse_to_fine(len(band)) if quick.points[k].provisional]
         for k in sorted(open_points, key=lambda k: quick.points[k].proposed is not None):
