@@ -1,5 +1,6 @@
 """Campaigns: the batch kernel against the simulated rig, draws, resuming, a cluster that loses a worker."""
 
+import errno
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import norm
 from typer.testing import CliRunner
 
 from tuning.campaign.batch import run_cases
@@ -29,11 +31,12 @@ from tuning.campaign.kernel import (
     TILE,
     X_PEAK,
 )
+from tuning.campaign.sampling import Correlation, drawn_values
 from tuning.campaign.scatter import LogNormal, Normal, Uniform, draw_factors
 from tuning.campaign.statistics import sensitivities, wilson, worst_first
 from tuning.loop import RigModel, margins, mode_grid
 from twin.plant.config import DampingTable
-from twin.plant.errors import InputError
+from twin.plant.errors import InputError, RunError
 from twin.plant.files import parse_toml
 from twin.rig.recorded import open_recording
 from twin.station.campaign.cases import Campaign, drawn_case, prepare, run_job, shape_of
@@ -43,6 +46,7 @@ from twin.station.campaign.spec import CampaignSpec
 from twin.station.cli import app
 
 CLOSE = 1e-9
+CASES = 9 * TILE + 7
 SPEC = """
 name = "tolerances"
 seed = 3
@@ -164,6 +168,66 @@ def test_damping_against_frequency_is_that_of_each_block() -> None:
     np.testing.assert_allclose(figures[:, CURRENT_SQUARES, 0], wanted[:, CURRENT_SQUARES], rtol=CLOSE)
 
 
+THREE_BODIES = """
+name = "three"
+[[body]]
+name = "table"
+mass_kg = 2.1
+attached_to = "ground"
+stiffness_n_m = 12300.0
+damping_ns_m = 5.0
+[[body]]
+name = "absorber"
+mass_kg = 0.4125
+attached_to = "table"
+stiffness_n_m = 40714.0
+damping_ns_m = 7.0
+[[body]]
+name = "cable"
+mass_kg = 0.05
+attached_to = "table"
+stiffness_n_m = 9000.0
+damping_ns_m = 1.0
+[[actuator]]
+name = "vcm"
+kind = "voice_coil"
+between = ["table", "absorber"]
+resistance_ohm = 2.7
+inductance_h = 0.0013
+force_constant_n_a = 8.0
+current_loop_kp_v_a = 100.0
+[[actuator]]
+name = "push"
+kind = "force"
+on = "table"
+[[sensor]]
+name = "table_acceleration"
+kind = "acceleration"
+of = "table"
+noise_density = 1e-3
+[[sensor]]
+name = "absorber_acceleration"
+kind = "acceleration"
+of = "absorber"
+noise_density = 1e-3
+[limits]
+vcm_current_a = 2.0
+vcm_power_w = 33.0
+stroke_m = 0.0095
+"""
+
+
+def test_a_plant_of_more_bodies_is_its_simulated_rig(tmp_path: Path) -> None:
+    (tmp_path / "three.toml").write_text(THREE_BODIES, encoding="utf-8")
+    text = SPEC.replace("seed = 3", f'seed = 3\nplants = ["{tmp_path / "three.toml"}"]')
+    campaign = campaign_of(text.replace("amplitude_v = 4.0", "amplitude_n = 8.0"))
+    figures, _ = by_the_kernel(campaign, [1])
+    wanted, _ = by_the_rig(campaign, 1)
+    for row in (X_PEAK, STROKE_PEAK, CURRENT_SQUARES, MOTION_WORK):
+        scale = np.abs(wanted[:, row]).max()
+        np.testing.assert_allclose(figures[:, row, 0], wanted[:, row], rtol=CLOSE, atol=CLOSE * scale)
+
+
 def test_a_case_is_the_same_to_the_bit_in_any_company() -> None:
     campaign = campaign_of(SPEC, draws=TILE + 5, seconds=0.3)
     everyone, _ = by_the_kernel(campaign, list(range(TILE + 5)))
@@ -212,6 +276,35 @@ def test_the_passive_rig_settles_to_what_it_is_compared_with() -> None:
     assert passive_motion(case, np.array([47.0]))[0] == pytest.approx(figures[-1, X_PEAK, 0], rel=2e-3)
 
 
+def test_every_case_gets_gains_of_its_own_where_it_is_retuned() -> None:
+    text = (
+        SPEC.replace("seed = 3", "seed = 3\nbudgets_w = [4.0]")
+        .replace("47.0", "49.5")
+        .replace("53.0", "50.5")
+    )
+    text = text.replace(
+        'kind = "thesis"\nat_hz = "45:55:1"', 'kind = "retuned"\nat_hz = "49,50,51"\nper_case = {own}'
+    )
+    text = text.replace('"45:55:5"', '"49:51:1"').replace("attenuation = 0.2\n", "")
+    rows = {
+        own: run_job(campaign, campaign.jobs[0])
+        for own in ("true", "false")
+        for campaign in [campaign_of(text, own=own, draws=3, seconds=3.0)]
+    }
+    campaign = campaign_of(text, own="true", draws=3, seconds=3.0)
+    assert campaign.schedules == (None,)
+    schedules = [drawn_case(campaign, k).case.schedule for k in range(3)]
+    assert len({s.gamma_n_m for s in schedules}) == 3
+    for own, common in zip(rows["true"], rows["false"], strict=True):
+        assert own["refused_points"] == 0
+        assert own["stable"]
+        assert own["modulus_margin"] >= 0.15 * (1.0 - 1e-3)
+        assert own["drawn absorber.stiffness_n_m"] == common["drawn absorber.stiffness_n_m"]
+    assert sum(r["attenuation_mean"] for r in rows["true"]) > sum(
+        r["attenuation_mean"] for r in rows["false"]
+    )
+
+
 def test_each_parameter_has_a_stream_of_its_own() -> None:
     mass = Normal(parameter="a.mass_kg", distribution="normal", std=0.1)
     delay = Uniform(parameter="loop.delay_us", distribution="uniform", low=1.0, high=2.0)
@@ -240,9 +333,51 @@ def test_draws_follow_their_distributions() -> None:
     assert u.max() <= 4.0
 
 
+SPREAD = (
+    Normal(parameter="a.mass_kg", distribution="normal", mean=2.0, std=0.3),
+    LogNormal(parameter="b.mass_kg", distribution="log_normal", median=3.0, sigma=0.5),
+    Uniform(parameter="c.mass_kg", distribution="uniform", low=1.0, high=4.0),
+)
+
+
+def table_of(kind: Any, draws: int, correlations: tuple[Correlation, ...] = ()) -> np.ndarray:
+    """Draws of `SPREAD`, (draws, 3)."""
+    return np.array(
+        [list(drawn_values(SPREAD, correlations, kind, 4, draws, k).values()) for k in range(draws)]
+    )
+
+
+@pytest.mark.parametrize("kind", ["latin_hypercube", "sobol"])
+def test_even_sampling_puts_one_draw_into_every_stratum(kind: str) -> None:
+    drawn, n = table_of(kind, 128), 128
+    shares = np.column_stack([
+        norm.cdf(drawn[:, 0], 2.0, 0.3), norm.cdf(np.log(drawn[:, 1] / 3.0) / 0.5), (drawn[:, 2] - 1.0) / 3.0
+    ])  # fmt: skip
+    for column in shares.T:
+        assert sorted(np.floor(column * n).astype(int)) == list(range(n))
+    assert abs(drawn[:, 0].mean() - 2.0) < 0.1 * 0.3 / np.sqrt(n)  # far below a random sample's error
+
+
+@pytest.mark.parametrize("kind", ["random", "latin_hypercube", "sobol"])
+def test_parameters_vary_together_as_they_were_told(kind: str) -> None:
+    tied = (Correlation(between=("a.mass_kg", "b.mass_kg"), coefficient=-0.8),)
+    drawn = table_of(kind, 1000, tied)
+    assert np.corrcoef(drawn[:, 0], np.log(drawn[:, 1]))[0, 1] == pytest.approx(-0.8, abs=0.06)
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2])[0, 1]) < 0.12
+    assert drawn[:, 0].std() == pytest.approx(0.3, rel=0.08)
+    if kind == "random":
+        np.testing.assert_array_equal(drawn[:, 2], table_of(kind, 1000)[:, 2])
+
+
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
+        (("std = 0.01", "std = 0.8"), "absorber.stiffness_n_m: std 0.8 .* below 0"),
+        (("seed = 3", 'seed = 3\nsampling = "grid"'), "sampling"),
+        (
+            ("[goal]", '[[correlation]]\nbetween = ["a.b", "loop.delay_us"]\ncoefficient = 0.5\n[goal]'),
+            "'a.b' is not",
+        ),
         (("seed = 3", "seed = 3\nsede = 4"), "sede: unknown key"),
         (("delay_us = 130.0", 'delay_us = "much"'), r"delay_us \[µs\]: must be a number of µs"),
         (("std = 0.01", "std = 0.01\nspread = 2"), r"scatter\[0\].*spread: unknown key"),
@@ -297,15 +432,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     """A specification of several jobs, run on threads, and its result."""
     folder = tmp_path_factory.mktemp("campaign")
     path = folder / "spec.toml"
-    path.write_text(SPEC.format(draws=3 * TILE + 7, seconds=1.5), encoding="utf-8")
+    path.write_text(SPEC.format(draws=CASES, seconds=1.5), encoding="utf-8")
     return path, run_campaign(CampaignOptions(path, threads=2), quiet, lambda _d, _n: None)
 
 
 def test_a_run_leaves_its_rows_its_plots_and_its_page(finished: tuple[Path, dict[str, Any]]) -> None:
     path, result = finished
     table = pq.read_table(result["results"])
-    assert table.column("case").to_pylist() == list(range(3 * TILE + 7))
-    assert result["cases"] == result["computed"] == 3 * TILE + 7
+    assert table.column("case").to_pylist() == list(range(CASES))
+    assert result["cases"] == result["computed"] == CASES
     assert result["meeting"] == sum(table.column("meets").to_pylist())
     assert sum(result["first_limits"].values()) == result["cases"]
     json.dumps(result, allow_nan=False)
@@ -330,25 +465,56 @@ def test_a_run_goes_on_where_it_was_left(finished: tuple[Path, dict[str, Any]], 
         run_campaign(CampaignOptions(other, out=path.with_suffix(".campaign")), quiet, lambda _d, _n: None)
 
 
-def test_interrupting_leaves_what_is_done(tmp_path: Path) -> None:
-    path = tmp_path / "long.toml"
-    path.write_text(SPEC.format(draws=40 * TILE, seconds=20.0), encoding="utf-8")
-    parts = path.with_suffix(".campaign") / "parts"
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_run_that_is_stopped_or_killed_is_finished_by_the_next(
+    how: signal.Signals, finished: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    path, result = finished
+    out = tmp_path / "results"
     run = subprocess.Popen(
-        [sys.executable, "-c", "from twin.station.cli import main; main()", "campaign", str(path), "--threads", "1"],
+        [
+            sys.executable, "-c", "from twin.station.cli import main; main()", "campaign", str(path), "--threads", "1",
+            "--out", str(out),
+        ],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        wait_for(lambda: any(parts.glob("part-*")))
-        run.send_signal(signal.SIGINT)
+        wait_for(lambda: any((out / "parts").glob("part-*")))
+        run.send_signal(how)
         _, complaint = run.communicate(timeout=60)
     finally:
         run.kill()
-    assert run.returncode == 130
+    assert run.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
     assert "Traceback" not in complaint
-    kept = sorted(parts.glob("part-*"))
-    assert 0 < len(kept) < 40
-    assert sum(pq.read_table(p).num_rows for p in kept) == TILE * len(kept)
+    kept = sum(pq.read_table(p).num_rows for p in (out / "parts").glob("part-*"))
+    assert 0 < kept < CASES
+    again = run_campaign(CampaignOptions(path, out=out, threads=2, plots=False), quiet, lambda _d, _n: None)
+    assert again["computed"] == CASES - kept
+    assert Path(again["results"]).read_bytes() == Path(result["results"]).read_bytes()
+    assert not list((out / "parts").glob(".*"))
+
+
+def test_a_full_disk_is_said_and_loses_nothing(
+    finished: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, result = finished
+    options = CampaignOptions(path, out=tmp_path / "full", threads=2, plots=False)
+    write, written = pq.write_table, []
+
+    def until_full(table: Any, to: Any) -> None:
+        if len(written) == 3:
+            Path(to).write_bytes(b"PAR1")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written.append(to)
+        write(table, to)
+
+    monkeypatch.setattr(pq, "write_table", until_full)
+    with pytest.raises(RunError, match=r"part-\d+.parquet: cannot be written \(No space left on device\)"):
+        run_campaign(options, quiet, lambda _d, _n: None)
+    monkeypatch.setattr(pq, "write_table", write)
+    again = run_campaign(options, quiet, lambda _d, _n: None)
+    assert again["computed"] == CASES - 3 * TILE
+    assert Path(again["results"]).read_bytes() == Path(result["results"]).read_bytes()
 
 
 def test_a_case_runs_again_alone_and_can_be_recorded(
@@ -388,6 +554,19 @@ def test_an_archive_is_replayed_recording_by_recording(
     assert result["failed"] == 1
     good = [row for row in result["rows"] if not row["trouble"]]
     assert all(row["blocks"] == 15 and row["decisions_repeated"] for row in good)
+    other = tmp_path / "other.toml"
+    other.write_text(
+        'name = "other"\n[archive]\nrecordings = "0.rrd"\nbudgets_w = [0.5, 4.0]\nmodulus_margins = [0.1, 0.3]\n',
+        encoding="utf-8",
+    )
+    rows = run_campaign(CampaignOptions(other, threads=2), quiet, lambda _d, _n: None)["rows"]
+    assert [(r["budget_w"], r["modulus_margin"]) for r in rows] == [
+        (0.5, 0.1),
+        (0.5, 0.3),
+        (4.0, 0.1),
+        (4.0, 0.3),
+    ]
+    assert all(r["trouble"] == "" and r["attenuation_mean"] == good[0]["attenuation_mean"] for r in rows)
 
 
 def wait_for(happened: Any, seconds: float = 60.0) -> None:
@@ -445,19 +624,19 @@ def test_a_cluster_that_loses_a_worker_loses_no_case(
     with Client(address, timeout=60, set_as_default=False) as client:
         client.wait_for_workers(3, timeout=60)
         busiest: list[int] = []
+        pids = client.run(os.getpid)
 
         def on_progress(done: int, total: int) -> None:
             # While others still work: the first rows are in, and one of the workers is lost.
-            if 0 < done < total and not busiest:
-                running = {a: keys for a, keys in client.processing().items() if keys}
-                pids = client.run(os.getpid)
-                busiest.append(pids[next(iter(running or pids))])
+            running = [a for a, keys in client.processing().items() if keys] if 0 < done < total else []
+            if running and not busiest:
+                busiest.append(pids[running[0]])
                 os.kill(busiest[0], signal.SIGKILL)
 
         options = CampaignOptions(path, out=tmp_path / "cluster", scheduler=address, plots=False)
         there = run_campaign(options, quiet, on_progress)
         assert len(client.scheduler_info(n_workers=-1)["workers"]) == 2
-    assert any(w.pid == busiest[0] for w in workers)
+    assert any(w.pid == busiest[0] and w.wait(10) == -signal.SIGKILL for w in workers)
     assert there["computed"] == result["cases"]
     assert Path(there["results"]).read_bytes() == Path(result["results"]).read_bytes()
 

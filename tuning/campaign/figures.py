@@ -223,8 +223,8 @@ def passive_motion(case: Case, frequency_hz: Array) -> Array:
         decays, vectors = np.linalg.eig(model.A)
         if np.linalg.cond(vectors) < WELL_CONDITIONED:
             # In modes one product for each frequency.
-            row, into = model.states.index(f"x_{plant.primary.name}"), model.inputs.index(case.exciter)
-            shares = vectors[row] * np.linalg.solve(vectors, model.B[:, into].astype(np.complex128))
+            moved, shaken = model.states.index(f"x_{plant.primary.name}"), model.inputs.index(case.exciter)
+            shares = vectors[moved] * np.linalg.solve(vectors, model.B[:, shaken].astype(np.complex128))
             return np.asarray(
                 case.amplitude * np.abs((1.0 / (2j * np.pi * frequency_hz[:, None] - decays)) @ shares)
             )

@@ -9,12 +9,16 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.special import ndtr, ndtri
 
 from twin.plant.config import DampingTable, Frozen, Plant, Positive
 from twin.plant.errors import InputError
 from twin.plant.files import unit_of
+from twin.plant.linear import Array
 
-MOST_TRIES = 1000
+MOST_REFUSED = 0.02
+"""A normal distribution with a larger share below zero is not what is meant: cut off there it is another one."""
+
 LOOP_DELAY, AMPLITUDE = "loop.delay_us", "excitation.amplitude"
 
 OF_BODIES = ("mass_kg", "stiffness_n_m", "damping_ns_m")
@@ -62,6 +66,10 @@ class Uniform(_Scatter):
         """One value."""
         return float(rng.uniform(self.low, self.high))
 
+    def at(self, share: Array) -> Array:
+        """Values below which these shares of all lie."""
+        return np.asarray(self.low + share * (self.high - self.low))
+
 
 class Normal(_Scatter):
     """Normal about ``mean`` with standard deviation ``std``; what is not above zero is drawn again."""
@@ -70,21 +78,28 @@ class Normal(_Scatter):
     mean: Positive = 1.0
     std: Positive
 
-    def draw(self, rng: np.random.Generator) -> float:
-        """One value above zero.
+    @model_validator(mode="after")
+    def _mostly_above_zero(self) -> Self:
+        share = float(ndtr(-self.mean / self.std))
+        if share > MOST_REFUSED:
+            raise ValueError(
+                f"{self.parameter}: std {self.std:g} about mean {self.mean:g} puts {100.0 * share:.2g} % below 0, "
+                'where nothing can be; make std smaller or take distribution = "log_normal"'
+            )
+        return self
 
-        Raises
-        ------
-        InputError
-            If practically none is.
-        """
-        for _ in range(MOST_TRIES):
+    def draw(self, rng: np.random.Generator) -> float:
+        """One value above zero."""
+        value = float(rng.normal(self.mean, self.std))
+        while value <= 0.0:
             value = float(rng.normal(self.mean, self.std))
-            if value > 0.0:
-                return value
-        raise InputError(
-            f"scatter {self.parameter}: std {self.std:g} leaves hardly a value above 0; make it smaller"
-        )
+        return value
+
+    def at(self, share: Array) -> Array:
+        """Values below which these shares of all that are above zero lie."""
+        above = 1.0 - float(ndtr(-self.mean / self.std))
+        # From the upper end: there the inverse keeps its precision, and what is above zero stays there.
+        return np.asarray(self.mean - self.std * ndtri(above * (1.0 - share)))
 
 
 class LogNormal(_Scatter):
@@ -97,6 +112,10 @@ class LogNormal(_Scatter):
     def draw(self, rng: np.random.Generator) -> float:
         """One value."""
         return float(self.median * np.exp(self.sigma * rng.standard_normal()))
+
+    def at(self, share: Array) -> Array:
+        """Values below which these shares of all lie."""
+        return np.asarray(self.median * np.exp(self.sigma * ndtri(share)))
 
 
 Scatter = Annotated[Uniform | Normal | LogNormal, Field(discriminator="distribution")]

@@ -15,11 +15,11 @@ from tuning.campaign.batch import Case, run_cases
 from tuning.campaign.batch import Excitation as Shape
 from tuning.campaign.figures import Goal, Judge
 from tuning.campaign.kernel import TILE
+from tuning.campaign.sampling import drawn_values
 from tuning.campaign.scatter import (
     AMPLITUDE,
     LOOP_DELAY,
     check_parameter,
-    draw_factors,
     noise_seed,
     nominal,
     scattered_plant,
@@ -38,6 +38,9 @@ from twin.station.campaign.spec import CampaignSpec, FromFile, Retuned, ThesisRu
 
 RETUNED_TOGETHER = 8
 """Cases of a job where every case is retuned: a job shall not take minutes."""
+
+FEWEST_PIECES, MOST_TILES = 64, 16
+"""A large campaign is cut into larger pieces, so that its folder does not fill with small files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +84,10 @@ class Campaign:
 
     @property
     def jobs(self) -> list[Job]:
-        """All the work, in pieces of a tile."""
-        size = (
-            RETUNED_TOGETHER
-            if isinstance(self.spec.schedule, Retuned) and self.spec.schedule.per_case
-            else TILE
-        )
+        """All the work, in pieces of whole tiles; the cut follows from the specification alone."""
+        retuned = isinstance(self.spec.schedule, Retuned) and self.spec.schedule.per_case
+        tiles = min(MOST_TILES, max(1, self.spec.cases // (FEWEST_PIECES * TILE)))
+        size = RETUNED_TOGETHER if retuned else tiles * TILE
         pieces = [
             (c, first)
             for c in range(len(self.spec.combinations))
@@ -119,7 +120,7 @@ def prepare(spec: CampaignSpec, folder: Path, say: Callable[[str], None]) -> Cam
     InputError
         If something cannot be used; the message names the key and the remedy.
     """
-    plants = tuple(load_plant(_place(folder, name)) for name in spec.plants)
+    plants = tuple(load_plant(place(folder, name)) for name in spec.plants)
     for plant in plants:
         for s in spec.scatter:
             check_parameter(s.parameter, plant)
@@ -170,7 +171,7 @@ def drawn_case(campaign: Campaign, number: int) -> Drawn:
     combination, draw = divmod(number, spec.draws)
     p, budget, e = spec.combinations[combination]
     plant, excitation = campaign.plants[p], spec.excitation[e]
-    drawn = draw_factors(spec.scatter, spec.seed, draw)
+    drawn = drawn_values(spec.scatter, spec.correlation, spec.sampling, spec.seed, spec.draws, draw)
     absolute = {s.parameter: s.scale == "absolute" for s in spec.scatter}
     base = {LOOP_DELAY: spec.delay_us, AMPLITUDE: excitation.amplitude}
     values = {}
@@ -380,7 +381,7 @@ def _nothing() -> GainSchedule:
     )  # fmt: skip
 
 
-def _place(folder: Path, name: str) -> str:
+def place(folder: Path, name: str) -> str:
     """A plant file beside the specification, or a preset's name."""
     beside = folder / name
     return str(beside) if beside.is_file() else name

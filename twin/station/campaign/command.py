@@ -57,7 +57,10 @@ def campaign(
     yield against the budget, the worst cases and what the result depends on; any case can be run again alone with
     `--replay`, with the twin beside it and a recording to look at.
 
-    An `[archive]` in the specification replays recordings instead. `--scheduler` needs the extra `cluster`.
+    An `[archive]` in the specification replays recordings instead, as they were or with other plants, budgets and
+    margins for the tuner. `--scheduler` needs the extra `cluster`; whoever reaches a Dask scheduler can run programs on
+    its workers, so give it TLS (`tls://` and Dask's own settings, see docs/examples/campaign-cluster.md) or keep it on
+    a network of your own.
     """
     from twin.station.campaign.run import CampaignOptions, run_campaign
 
@@ -115,14 +118,16 @@ def _table(r: dict[str, Any]) -> Table:
 
 def _archive_table(r: dict[str, Any]) -> Table:
     table = Table(
-        "recording", "plant", "attenuation", "worst", "power", "median NIS", "", box=box.SIMPLE,
-        title=f"Archive {r['name']}: {r['recordings']} recordings", title_justify="left",
+        "recording", "plant", "budget", "margin", "attenuation", "worst", "power", "proposed", "at power", "median NIS",
+        "", box=box.SIMPLE, title=f"Archive {r['name']}: {r['recordings']} recordings, {r['replays']} replays",
+        title_justify="left",
     )  # fmt: skip
     for row in r["rows"]:
         table.add_row(
-            Path(row["recording"]).name, row["plant"] or "-", percent(row["attenuation_mean"]),
-            percent(row["attenuation_worst"]), with_unit(row["joule_mean_w"], "W"), number(row["nis_median"]),
-            row["trouble"],
+            Path(row["recording"]).name, row["plant"] or "-", with_unit(row["budget_w"], "W"),
+            number(row["modulus_margin"]), percent(row["attenuation_mean"]), percent(row["attenuation_worst"]),
+            with_unit(row["joule_mean_w"], "W"), percent(row["proposed_attenuation"]),
+            with_unit(row["proposed_joule_mean_w"], "W"), number(row["nis_median"]), row["trouble"],
         )  # fmt: skip
     return table
 

@@ -4,6 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from tuning.campaign.sampling import Correlation, correlation_root
+from tuning.campaign.sampling import Kind as Sampling
 from tuning.campaign.scatter import Scatter
 from tuning.types import BudgetKind
 from twin.plant.config import Frozen, Name, NonNegative, Positive
@@ -72,9 +74,24 @@ class GoalSpec(Frozen):
 
 
 class Archive(Frozen):
-    """Recordings to be replayed instead of cases to be simulated: a pattern such as ``runs/**/*.rrd``."""
+    """Recordings to be replayed instead of cases to be simulated.
+
+    Attributes
+    ----------
+    recordings
+        A pattern such as ``runs/**/*.rrd``, from the folder of the specification on.
+    plants
+        Presets or plant files in place of the one that each recording carries; several compare models or coils.
+    budgets_w, budget_kind, modulus_margins
+        What the tuner is asked in place of what it was asked then: every recording is replayed with every combination,
+        and what would have been proposed is kept.
+    """
 
     recordings: str
+    plants: tuple[str, ...] = ()
+    budgets_w: tuple[Positive, ...] = ()
+    budget_kind: BudgetKind = "joule_mean"
+    modulus_margins: tuple[NonNegative, ...] = ()
 
 
 class CampaignSpec(Frozen):
@@ -92,6 +109,8 @@ class CampaignSpec(Frozen):
         Between measuring and the converter's update; any number, parts of a sample included.
     sensor_noise
         Whether the accelerometers are noisy; drawn as the simulated rig draws it, which triples the time.
+    sampling, correlation
+        How the draws are spread (``random``, ``latin_hypercube``, ``sobol``), and parameters that vary together.
     report_hz
         Where poles and margins are looked at.
     """
@@ -112,12 +131,18 @@ class CampaignSpec(Frozen):
     schedule: Schedule | None = None
     goal: GoalSpec = GoalSpec()
     scatter: tuple[Scatter, ...] = ()
+    sampling: Sampling = "random"
+    correlation: tuple[Correlation, ...] = ()
     archive: Archive | None = None
 
     @model_validator(mode="after")
     def _asks_one_thing(self) -> Self:
         if self.archive is not None:
-            extra = [key for key in ("excitation", "schedule", "scatter", "budgets_w") if getattr(self, key)]
+            extra = [
+                key
+                for key in ("excitation", "schedule", "scatter", "correlation", "budgets_w")
+                if getattr(self, key)
+            ]
             if extra:
                 raise ValueError(
                     f"archive: recordings are replayed as they are; leave out {', '.join(extra)}"
@@ -139,6 +164,7 @@ class CampaignSpec(Frozen):
             raise ValueError(
                 f"scatter: {', '.join(twice)} is there twice; give each parameter one distribution"
             )
+        correlation_root(tuple(names), self.correlation)
         noisy = [name for name in names if name.endswith(".noise_density")]
         if noisy and not self.sensor_noise:
             raise ValueError(f"scatter: {noisy[0]} does nothing without noise; add sensor_noise = true")
