@@ -34,7 +34,7 @@ _BAND_95 = 1.96
 SHOWN_NIS = 10.0
 """A larger one is drawn as this: what it was before the filter had settled would leave no room for the rest."""
 
-REPEAT_S = 60.0
+REPEAT_S = 10.0
 """What is said when it changes is said again so often, for a viewer that has come since and does not have it all."""
 
 
@@ -81,7 +81,7 @@ class RerunView:
         self._repeat_at_s = REPEAT_S
         self._groups = groups_of(plant, channels)
         own_hz = _own_hz(plant)
-        self._schematic = Schematic(stream, self._fast, plant)
+        self._schematic = Schematic(stream, self._fast, plant, pace.text_s)
         self._spectral = spectrum_column(plant, channels)
         self._spectrum: SpectrumPlot | None = None
         spectrum_name = ""

@@ -92,7 +92,7 @@ class Drawing:
         """Range of x and of y that holds everything."""
         right, bottom = self.size
         right = max(right, self.bar[0])
-        return (-8.0, right + 11.0), (-0.5 * BODY_HEIGHT - 18.0, bottom + RULER_Y + 11.0)
+        return (-8.0, right + 11.0), (-0.5 * BODY_HEIGHT - 18.0, bottom + RULER_Y + 13.0)
 
     @property
     def size(self) -> tuple[float, float]:

@@ -15,8 +15,8 @@ class Pace:
         Width of the window in which slow quantities are shown [s]; None for the whole run.
     follow
         Whether the viewer keeps up with the end of the data.
-    spectrum_s, curve_s, image_s
-        Time between spectra, between curves of the damping, and at least between images of the waterfall [s].
+    spectrum_s, curve_s, text_s, image_s
+        Time between spectra, curves of the damping, figures in the drawing and, at least, images of the waterfall [s].
     """
 
     hold_blocks: int
@@ -25,11 +25,12 @@ class Pace:
     follow: bool
     spectrum_s: float
     curve_s: float
+    text_s: float
     image_s: float
 
 
-WATCHED = Pace(1, 5, trend_s=30.0, follow=True, spectrum_s=0.1, curve_s=0.5, image_s=0.5)
+WATCHED = Pace(1, 5, trend_s=30.0, follow=True, spectrum_s=0.1, curve_s=0.5, text_s=0.5, image_s=0.5)
 """For people who look on as it happens."""
 
-KEPT = Pace(50, 50, trend_s=None, follow=False, spectrum_s=1.0, curve_s=1.0, image_s=1.0)
+KEPT = Pace(50, 50, trend_s=None, follow=False, spectrum_s=1.0, curve_s=1.0, text_s=1.0, image_s=1.0)
 """For a file that is looked at afterwards."""

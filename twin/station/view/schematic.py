@@ -22,8 +22,8 @@ from twin.station.view.stroboscope import Stroboscope, slower_by
 ARROW = 16.0
 """Length of an arrow at full scale."""
 
-TEXT_S = 0.5
-"""Time between changes of what is written [s]."""
+PEAK_SAMPLES = 500
+"""So many of a block's samples tell the largest value well enough for a scale."""
 
 
 class Schematic:
@@ -35,9 +35,11 @@ class Schematic:
         Where to; what moves goes through the columns.
     plant
         What is drawn.
+    text_s
+        Time between changes of what is written [s].
     """
 
-    def __init__(self, stream: rr.RecordingStream, columns: Columns, plant: Plant) -> None:
+    def __init__(self, stream: rr.RecordingStream, columns: Columns, plant: Plant, text_s: float) -> None:
         self._stream, self._columns, self._plant = stream, columns, plant
         self._drawing: Drawing = draw(plant)
         self._strobe = Stroboscope()
@@ -45,7 +47,7 @@ class Schematic:
         self._loupe = FollowingScale(1e-9)
         self._force = {a.name: FollowingScale(1e-6) for a in plant.actuator}
         self._current = FollowingScale(1e-3)
-        self._text_at_s = -np.inf
+        self._text_s, self._text_at_s = text_s, -np.inf
         self._marks_at: tuple[float, ...] = ()
         StillParts(stream, self._drawing, plant).draw()
 
@@ -63,7 +65,8 @@ class Schematic:
         rows = np.clip(np.round(flashes * rate).astype(int) - block.first_sample, 0, block.n_samples - 1)
         at = {name: k for k, name in enumerate(estimate.states)}
         columns = {b.name: at[f"x_{b.name}"] for b in self._plant.body if f"x_{b.name}" in at}
-        peaks = {name: float(np.max(np.abs(estimate.mean[:, k]))) for name, k in columns.items()}
+        few = slice(None, None, max(1, block.n_samples // PEAK_SAMPLES))
+        peaks = {name: _peak(estimate.mean[few, k]) for name, k in columns.items()}
         self._motion.follow(max(peaks.values(), default=0.0))
         self._move(flashes, {name: estimate.mean[rows, k] for name, k in columns.items()})
         primary = self._plant.primary.name
@@ -75,7 +78,7 @@ class Schematic:
         drives = {a.name: drive_of(a, frame) for a in self._plant.actuator}
         self._point(flashes, rows, drives)
         if block.end_s >= self._text_at_s - 1e-9:
-            self._text_at_s = block.end_s + TEXT_S
+            self._text_at_s = block.end_s + self._text_s
             self._stream.set_time(TIMELINE, duration=nanoseconds(block.end_s)[0])
             self._write(frame, peaks, drives, hz)
 
@@ -107,7 +110,7 @@ class Schematic:
             if force is None:
                 lengths[actuator.name] = np.zeros(len(rows))
                 continue
-            scale.follow(_peak(force))
+            scale.follow(_peak(force[:: max(1, len(force) // PEAK_SAMPLES)]))
             lengths[actuator.name] = ARROW / scale.full * force[rows]
         vectors = []
         for actuator, _, sign in pushes(self._plant):
@@ -118,7 +121,7 @@ class Schematic:
         voice_coil = self._plant.voice_coil
         current = None if voice_coil is None else drives[voice_coil.name]
         if current is not None:
-            self._current.follow(_peak(current))
+            self._current.follow(_peak(current[:: max(1, len(current) // PEAK_SAMPLES)]))
             up = -0.6 * ARROW / self._current.full * np.nan_to_num(current[rows])
             self._columns.add_arrows(f"{ROOT}/current", time_s, np.column_stack([0.0 * up, up])[:, None, :])
 
@@ -160,7 +163,7 @@ class Schematic:
         self._stream.log(f"{ROOT}/figures", text)
         p = frame.performance
         if p is not None:
-            marks = tuple(round(v / self._loupe.full, 3) for v in (p.limit_m, p.passive_m))
+            marks = tuple(round(v / self._loupe.full, 2) for v in (p.limit_m, p.passive_m))
             if marks != self._marks_at:
                 self._marks_at = marks
                 self._mark(marks)

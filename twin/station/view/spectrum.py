@@ -8,8 +8,9 @@ from twin.plant.linear import Array
 BINS = 250
 """Lines from zero to the highest frequency."""
 
-GUARD = 2.56
-"""Samples per period of the highest frequency that are kept: what would fold back below it is filtered out first."""
+GUARD = 4.0
+"""Samples per period of the highest frequency that are kept. More than the usual 2.56: the filter that keeps the rest
+from folding back is then so much shorter that all of it costs half."""
 
 MOST_MISSING = 0.02
 """A window with a larger share of samples missing has no spectrum."""
@@ -41,7 +42,7 @@ class SlidingSpectrum:
     def __init__(self, sample_rate_hz: float, top_hz: float, n_signals: int) -> None:
         self._step = max(1, int(sample_rate_hz / (GUARD * top_hz)))
         rate = sample_rate_hz / self._step
-        top_hz = min(top_hz, rate / GUARD)
+        top_hz = min(top_hz, rate / 2.56)
         n = round(rate * BINS / top_hz)
         self.frequency_hz = np.fft.rfftfreq(n, 1.0 / rate)[: BINS + 1]
         self.window_s = n / rate
