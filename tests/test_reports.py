@@ -513,6 +513,26 @@ def test_everything_said_is_json_without_nan_and_bytes_of_a_page_repeat(
     assert as_html(plot) == as_html(plot)
 
 
+def test_pages_of_an_hour_stay_small(case: Callable[[str], Replayed]) -> None:
+    n, rng = 36_000, np.random.default_rng(3)
+    run = case("whatif_budget_change")
+    motion, hz = 1e-5 * rng.uniform(0.5, 1.5, n), 50.0 + 5.0 * np.sin(np.arange(n) / 900.0)
+    hour = made(
+        run, n, 0.1, "hour", frequency_hz=hz, displacement_m=motion, stroke_peak_m=1e-3, joule_mean_w=motion * 1e5,
+        joule_peak_w=1.0, electrical_mean_w=1.0, current_peak_a=0.5, budget_w=4.0, nis=rng.uniform(0.9, 1.1, n),
+        nis_low=0.95, nis_high=1.05, masked=(np.arange(n) % 3 == 0).astype(float),
+    )  # fmt: skip
+    passive = np.full(n, 1e-4)
+    hour = replace(
+        hour, hindsight=Hindsight(passive, 0.01 * passive, 1.0 - motion / passive, 0.01 * passive / 1e-4)
+    )
+    assert len(filed.filed_page(hour, document(hour))) < 1_500_000
+    c = compare([hour, replace(hour, name="again")], "time")
+    assert len(c.grid) <= 600
+    assert c.step == pytest.approx(6.0)
+    assert sum(len(as_html(plot)) for plot in compare_plots.comparison_plots(c)[:2]) < 400_000
+
+
 def test_parts_of_a_page_escape_what_is_not_html_already() -> None:
     assert text("<b>") == "&lt;b&gt;"
     assert text(Html("<b>")) == "<b>"

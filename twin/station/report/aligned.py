@@ -19,6 +19,9 @@ from twin.station.report.replayed import Replayed
 By = Literal["frequency", "time"]
 
 STEP_HZ = 0.5
+MOST_CELLS = 600
+"""Of time, unless a person asks for more."""
+
 SLOPE_SPREAD = 0.15
 """A slope is fitted where the blocks of a cell spread (standard deviation) over this share of it; spread evenly over
 the whole cell they have 0.29."""
@@ -111,7 +114,8 @@ def common_grid(runs: list[Replayed], by: By, step: float | None) -> tuple[Array
     Parameters
     ----------
     step
-        Width of a cell [Hz] or [s]; half a hertz, or the longest run's block, unless given.
+        Width of a cell [Hz] or [s]; half a hertz unless given, or the longest block, and no more than `MOST_CELLS` of
+        time.
 
     Raises
     ------
@@ -119,7 +123,10 @@ def common_grid(runs: list[Replayed], by: By, step: float | None) -> tuple[Array
         If a run has no excitation frequency, or none in common with the reference; the message says which and where.
     """
     if step is None:
-        step = STEP_HZ if by == "frequency" else max(float(np.median(r.tracks["duration_s"])) for r in runs)
+        step = STEP_HZ
+        if by == "time":
+            block_s = max(float(np.median(run.tracks["duration_s"])) for run in runs)
+            step = block_s * max(1, math.ceil(min(run.seconds for run in runs) / (MOST_CELLS * block_s)))
     cells = []
     for run in runs:
         x = places(run, by)

@@ -66,7 +66,7 @@ def compare(
 
     JSON keys: reference, by, step, grid, runs (file, sha256, verify, figures as of replay), figures (values, std,
     differences, differences_std), quantities (by name: runs with value, std, blocks; differences with value, std,
-    summary), damping, health, configuration (key, values), events, decisions, gains.
+    summary, relative), damping, health, configuration (key, values), events, decisions, gains.
     """
     from twin.station.report.compare_page import comparison_page, comparison_tables
     from twin.station.report.compare_plots import comparison_plots

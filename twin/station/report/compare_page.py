@@ -21,6 +21,7 @@ SECTIONS = (
 MOST_SETTINGS = 40
 """More of them are on the page alone."""
 
+MOST_ROWS = 1200
 LEVELS = {"error": "bad", "warning": "warn", "info": "open"}
 
 
@@ -254,6 +255,8 @@ def _events(said: dict[str, Any], names: list[str]) -> Html:
 
 
 def _cells(c: Comparison, said: dict[str, Any], names: list[str]) -> Html:
+    if len(c.grid) > MOST_ROWS:
+        return element("p", f"{len(c.grid)} cells: with --json.")
     parts = []
     unit = "Hz" if c.by == "frequency" else "s"
     for q in said["quantities"].values():

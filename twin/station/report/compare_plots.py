@@ -14,6 +14,9 @@ from twin.station.validation.canvas import dress
 
 COLOURS = ("#1565c0", "#e65100", "#2e7d32", "#8e24aa", "#00838f", "#5d4037", "#c2185b", "#455a64")
 MARKS = "osD^vP*X"
+MOST_BARS = 150
+"""Of more cells the uncertainty is drawn as a band."""
+
 SHOWN = (
     "attenuation",
     "displacement_m",
@@ -87,7 +90,9 @@ def _points(axes: Axes, x: Array, y: Array, std: Array, k: int, label: str) -> N
     colour, mark = COLOURS[k % len(COLOURS)], MARKS[k % len(MARKS)]
     known = np.isfinite(y)
     bars = np.where(np.isfinite(std), std, 0.0)
-    if (bars[known] > 0.0).any():
+    if (bars[known] > 0.0).any() and len(x) > MOST_BARS:
+        axes.fill_between(x[known], (y - bars)[known], (y + bars)[known], color=colour, alpha=0.2, lw=0)
+    elif (bars[known] > 0.0).any():
         axes.errorbar(x[known], y[known], bars[known], fmt="none", ecolor=colour, lw=0.9, label="_bars")
     size = 4.0 if len(x) < 80 else 0.0
     axes.plot(x[known], y[known], color=colour, marker=mark, ms=size, lw=1.2, label=label)

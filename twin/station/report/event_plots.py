@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from twin.station.report.figures import MOST_POINTS
 from twin.station.report.replayed import Replayed
 from twin.station.validation.canvas import CONTROLLED, LIMIT, PASSIVE, SECOND, THIRD, dress
 
@@ -62,7 +63,8 @@ def draw_timeline(figure: Figure, run: Replayed) -> None:
     for name, times, colour, mark in marks:
         if name not in names:
             names.append(name)
-        axes.plot(times, [-names.index(name)] * len(times), mark, color=colour, ms=6, ls="", label="_marks")
+        shown = times[:: -(-len(times) // MOST_POINTS) or 1]
+        axes.plot(shown, [-names.index(name)] * len(shown), mark, color=colour, ms=6, ls="", label="_marks")
     axes.set_yticks([-k for k in range(len(names))], names)
     axes.set_ylim(-len(names) + 0.4, 0.6)
     for state, colour in seen.items():

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from twin.plant.linear import Array
 from twin.station.report.event_plots import draw_audit, draw_timeline
-from twin.station.report.figures import Plot, thinned
+from twin.station.report.figures import MOST_POINTS, Plot, thinned
 from twin.station.report.replayed import Replayed
 from twin.station.validation.canvas import CONTROLLED, LIMIT, PASSIVE, SECOND, SHADES, THIRD, dress
 
@@ -17,6 +17,9 @@ LEAST_M, LEAST_DB = 1e-8, -60.0
 
 DWELL_HZ = 0.5
 """An excitation that moves by less stands still: no line is drawn along it."""
+
+MOST_BARS = 500
+"""Points with a bar each; of more every second, third and so on is drawn."""
 
 GROUND_ON = "#eaf2fb"
 
@@ -156,6 +159,7 @@ def _attenuation(figure: Figure, run: Replayed) -> None:
     h, hz = run.hindsight, run.tracks["frequency_hz"]
     known = np.isfinite(h.attenuation) & np.isfinite(hz)
     order = np.argsort(hz[known], kind="stable")
+    order = order[:: -(-len(order) // MOST_BARS)]
     f, left = hz[known][order], np.maximum(1.0 - h.attenuation[known][order], 10.0 ** (LEAST_DB / 20.0))
     std = h.attenuation_std[known][order]
     db = 20.0 * np.log10(left)
@@ -244,7 +248,8 @@ def _health(figure: Figure, run: Replayed) -> None:
     top, low = figure.subplots(2, 1, sharex=True)
     a, b = t["nis_low"], t["nis_high"]
     if _any(a) and _any(b):
-        top.fill_between(x, a, b, color=THIRD, alpha=0.2, lw=0)
+        some = slice(None, None, -(-len(x) // MOST_POINTS))
+        top.fill_between(x[some], a[some], b[some], color=THIRD, alpha=0.2, lw=0)
     _line(top, x, t["nis"], "#37474f", "NIS", lw=1.2)
     dress(top, "", "NIS [1]")
     for k, sensor in enumerate(run.tracks.sensors):
