@@ -92,8 +92,8 @@ class PlayerBody(_Body):
     value: float = 0.0
 
 
-def page_app(desk: Desk) -> FastAPI:
-    """Everything behind the guard."""
+def page_app(desk: Desk, over: threading.Event) -> FastAPI:
+    """Everything behind the guard; streams end when it is over."""
     app = FastAPI(title="atmd", docs_url=None, redoc_url=None, openapi_url=None)
     folder = files("twin.station") / "page"
     charts = (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
@@ -147,7 +147,7 @@ def page_app(desk: Desk) -> FastAPI:
     @app.get("/api/stream")
     async def stream(request: Request) -> Response:
         """Status as server-sent events, for as long as the browser listens."""
-        return StreamingResponse(_states(desk, request), media_type="text/event-stream")
+        return StreamingResponse(_states(desk, request, over), media_type="text/event-stream")
 
     @app.post("/api/whatif")
     def whatif(body: WhatIfBody) -> Response:
@@ -226,10 +226,10 @@ def _stand_ins(charts: bytes) -> bytes:
     return b"".join(b'<template id="%s"></template>' % name for name in re.findall(guarded, charts))
 
 
-async def _states(desk: Desk, request: Request) -> AsyncIterator[str]:
+async def _states(desk: Desk, request: Request, over: threading.Event) -> AsyncIterator[str]:
     seq = 0
     with desk.watcher():
-        while not await request.is_disconnected():
+        while not (over.is_set() or await request.is_disconnected()):
             log = desk.log_after(seq)
             seq = log[-1]["seq"] if log else seq
             yield f"data: {json.dumps({**desk.state(), 'log': log}, allow_nan=False)}\n\n"
@@ -328,6 +328,7 @@ class OperatorPage:
 
     def __init__(self, desk: Desk, bind: str = "127.0.0.1", port: int = 0) -> None:
         self.desk = desk
+        self._over = threading.Event()
         listener = _listener(bind, port)
         port = int(listener.getsockname()[1])
         names = {"127.0.0.1", "localhost", "[::1]", f"[{bind}]" if ":" in bind else bind}
@@ -343,7 +344,7 @@ class OperatorPage:
         shown = f"[{shown}]" if ":" in shown else shown
         token = secrets.token_urlsafe(24)
         app = Guard(
-            page_app(desk),
+            page_app(desk, self._over),
             token,
             {f"{name}:{port}" for name in names},
             security_policy(desk.viewer_url),
@@ -382,6 +383,7 @@ class OperatorPage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._over.set()  # a browser that listens would hold the end up
         self._server.should_exit = True
         self._thread.join(5.0)
         self.desk.close()
