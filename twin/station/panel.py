@@ -225,8 +225,6 @@ class Panel:
                 self.add(block.start_s, "decision", words)
             else:
                 self._refusal = {"command_id": answer.command_id, "reason": answer.reason}
-                words = f"command {answer.command_id} refused by the rig: {answer.reason}"
-                self.add(block.start_s, "warning", words)
             if self._sent is not None and self._sent["command_id"] == answer.command_id:
                 state = "acknowledged" if answer.accepted else "refused"
                 self._sent = {**self._sent, "state": state, "at_sample": at, "reason": answer.reason}

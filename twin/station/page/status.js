@@ -38,7 +38,7 @@ export function showStatus(s) {
     chip("s-clock", "–", "");
   } else {
     chip("s-blocks", `${w.lost}${w.late ? `, ${w.late} late` : ""}`, w.lately ? "warn" : "good", `${w.lost} lost, ${w.late} late, ${w.repeated} repeated, ${w.reordered} put back in order, ${w.malformed} malformed, rig began anew ${w.restarts} times`);
-    chip("s-clock", w.drift_ppm === null ? "–" : `${number(w.drift_ppm, 2)} ppm`, "", "rig's clock against the station's");
+    chip("s-clock", drift(w.drift_ppm), "", "rig's clock against the station's");
   }
   const margin = s.load > 0 ? 1 / s.load : null;
   chip("s-load", margin === null ? "–" : `${number(margin, 2)}×`, s.load > 0.7 ? "bad" : s.load > 0.4 ? "warn" : "good", "time of a block over the time the loop needs for it");
@@ -51,6 +51,8 @@ export function showStatus(s) {
   lines("notices", notices);
   sum(s, alarms);
 }
+
+const drift = (ppm) => (ppm === null ? "–" : Math.abs(ppm) < 1e4 ? `${number(ppm, 2)} ppm` : `${number(ppm / 1e4, 2)} %`);
 
 function lines(id, texts) {
   const box = document.getElementById(id), all = texts.join("|");
