@@ -1,14 +1,12 @@
 """Reading back the series a `RerunView` wrote, for summaries without Rerun's viewer."""
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rerun.chunk import RrdReader
-from rerun.error_utils import RerunWarning
 
 from twin.plant.linear import Array
+from twin.rig.rrf import rows
 
 _VALUES = {"Scalars:scalars": "SeriesLines:names", "Measurements:values": "Measurements:names"}
 
@@ -25,13 +23,12 @@ class Series:
 
 def read_series(path: Path) -> dict[str, Series]:
     """Every scalar series and measurement in a recording, by entity path without its leading slash."""
-    rows: dict[tuple[str, str], list[tuple[Array, Array]]] = {}
+    parts: dict[tuple[str, str], list[tuple[Array, Array]]] = {}
     names: dict[str, tuple[str, ...]] = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RerunWarning)
-        stream = RrdReader(path).stream()
-    for chunk in stream.drop(content="/record/**"):
-        batch, entity = chunk.to_record_batch(), chunk.entity_path.lstrip("/")
+    for logged in rows(path):
+        batch, entity = logged.batch, logged.entity.lstrip("/")
+        if batch is None or entity.startswith("record/"):
+            continue
         for column in batch.schema.names:
             if column in _VALUES.values():
                 names[entity] = tuple(batch.column(column)[batch.num_rows - 1].as_py() or ())
@@ -39,13 +36,13 @@ def read_series(path: Path) -> dict[str, Series]:
                 values = np.asarray(batch.column(column).flatten(), dtype=np.float64)
                 time_s = np.asarray(batch.column("time").cast("int64")) * 1e-9
                 kind = "variance" if column == "Measurements:variances" else "value"
-                rows.setdefault((entity, kind), []).append((time_s, values.reshape(len(time_s), -1)))
+                parts.setdefault((entity, kind), []).append((time_s, values.reshape(len(time_s), -1)))
     found = {}
-    for (entity, kind), parts in rows.items():
+    for (entity, kind), some in parts.items():
         if kind == "variance":
             continue
-        time_s, values = _sorted(parts)
-        spread = rows.get((entity, "variance"))
+        time_s, values = _sorted(some)
+        spread = parts.get((entity, "variance"))
         std = None if spread is None else np.sqrt(_sorted(spread)[1])
         labels = names.get(entity, ())
         found[entity] = Series(time_s, values, labels or ("",) * values.shape[1], std)
