@@ -299,7 +299,7 @@ live.close(5.0)
 stream.disconnect()
 report["closing_s"] = time.perf_counter() - start
 report |= {"dropped": live.dropped, "pids": pids, "phases": [
-    sorted(part)[len(part) // 2] for part in (spent[:30], spent[30:80], spent[80:150], spent[150:])
+    [sorted(part)[len(part) // 2], max(part)] for part in (spent[:30], spent[30:80], spent[80:150], spent[150:])
 ]}
 from rerun.experimental import ViewerClient
 client = ViewerClient.connect(keeper._control)
@@ -326,8 +326,10 @@ def test_a_viewer_killed_stopped_and_started_costs_no_time_and_no_sample_and_see
     assert {"2D", "StateTimeline", "TextLog", "TimeSeries"} <= set(told["views"])
     assert told["dropped"] == 0  # the server kept for the viewer what it could not take
     assert told["closing_s"] < 10.0
-    undisturbed, *others = told["phases"]
-    assert max(others) < 4.0 * undisturbed + 2e-3
+    # Generous, for a machine that has much else to do; a block that waited for the viewer would wait for seconds.
+    (median, worst), *others = told["phases"]
+    assert max(m for m, _ in others) < 10.0 * median + 0.02
+    assert max(w for _, w in others) < 20.0 * worst + 0.5
     recording = open_recording(tmp_path / "run.rrd")
     assert not recording.repaired
     assert recording.end_sample == 20 * RATE

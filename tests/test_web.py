@@ -152,9 +152,7 @@ def test_a_browser_draws_the_run_and_asks_nobody_else(
 
     url, stream = served
     plant = load_plant("rig")
-    view = RerunView(
-        stream, plant=plant, sample_rate_hz=RATE, channels=channels(plant), schedule=schedule()
-    )
+    view = RerunView(stream, plant=plant, sample_rate_hz=RATE, channels=channels(plant), schedule=schedule())
     live = LiveView(view, depth=100)
     for frame in frames(plant, 6.0):
         live.show(frame)
