@@ -157,7 +157,7 @@ class Schematic:
             say(
                 0.5 * GAP - 7.0, y + 3.0, f"{hz:.2f} Hz" + (f", {slower:.0f}× slower" if slower > 1.0 else "")
             )
-        say(x, y + 3.0, f"{self._plant.primary.name}: ruler ±{in_words(self._loupe.full, 'm')}")
+        say(x, y + 3.0, f"ruler ±{in_words(self._loupe.full, 'm')}")
         say(self._drawing.bar[0], y + 3.0, f"bar {in_words(self._motion.full, 'm')}")
         text = rr.Points2D(places, labels=texts, colors=palette.array(colours), radii=0.0, show_labels=True)
         self._stream.log(f"{ROOT}/figures", text)
