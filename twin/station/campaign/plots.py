@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from twin.plant.errors import RunError
 from twin.station.campaign.spec import CampaignSpec
@@ -96,6 +97,10 @@ def _cases_figure(rows: Sequence[dict[str, Any]]) -> Figure:
             x = [100.0 * max(1.0 - r["attenuation_mean"], 1e-6) for r in known]
             y = [100.0 * max(1.0 - r["attenuation_worst"], 1e-6) for r in known]
             left.loglog(x, y, ".", color=colour, ms=5, alpha=0.6, label=f"{label} ({len(some)})")
+    for axis in (left.xaxis, left.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.set_minor_formatter(NullFormatter())
     dress(left, "mean motion left [% of passive]", "worst motion left [% of passive]", "Every case")
     counts: dict[str, int] = {}
     for row in rows:
@@ -168,6 +173,9 @@ border-bottom:1px solid #ddd}}pre{{background:#f4f6f8;padding:1rem;overflow:auto
 <p>{result["cases"]} cases: {result["meeting"]} ({share:.1f} %) keep everything, {result["stable"]} are stable on the
 whole grid. Results of every case are in <code>cases.parquet</code> beside this page.</p>
 {pictures}
+<p>R² is the share of a result's variance, on ranks, that the regression explains. Where it is low, the result does not
+rise or fall steadily with the parameters (an absorber may be off to either side) or they act together: the bars then
+say little.</p>
 <h2>Worst cases</h2><table><tr>{head}</tr>{body}</table>
 <p>Any of them runs again, alone: <code>{html.escape(command)}</code></p>
 <h2>What was asked</h2><pre>{described}</pre></body></html>
