@@ -171,15 +171,17 @@ def to_cells(run: Replayed, quantity: Quantity, by: By, grid: Array, step: float
     settled = run.tracks["settled"] > 0.0
     if by == "frequency" and quantity.settled_only and settled.any():
         counts &= settled
-    cell = np.full(len(x), np.iinfo(np.int64).min)
-    cell[counts] = _cell(x[counts], by, step)
+    order = np.flatnonzero(counts)[np.argsort(x[counts], kind="stable")]
+    places_in_order = x[order]
+    cell = _cell(places_in_order, by, step)
     value, known, scatter = (np.full(len(grid), np.nan) for _ in range(3))
     blocks = np.zeros(len(grid), dtype=np.int64)
     for k, number in enumerate(_cell(grid, by, step)):
-        rows = np.flatnonzero(cell == number)
+        first, end = np.searchsorted(places_in_order, [grid[k] - step, grid[k] + step])
+        near = order[first:end]
+        rows = near[cell[first:end] == number]
         blocks[k] = len(rows)
         if len(rows):
-            near = np.flatnonzero(counts & (np.abs(x - grid[k]) <= step))
             around = (x[near] - grid[k]) / step, y[near]
             value[k], scatter[k] = _at_centre((x[rows] - grid[k]) / step, y[rows], *around)
             stated = quantity.std[rows]

@@ -190,6 +190,9 @@ def _running_mean(values: Array, duration_s: Array, window_s: float, alike: Arra
         Time counts anew wherever this changes. The longest stretch counts where none is long enough.
     """
     out = np.full(len(values), np.nan)
+    known = np.isfinite(values)
+    weight = np.concatenate([[0.0], np.cumsum(np.where(known, duration_s, 0.0))])
+    weighted = np.concatenate([[0.0], np.cumsum(np.where(known, duration_s * values, 0.0))])
     first, spent = 0, 0.0
     partial = (0.0, -1, math.nan)
     for k in range(len(values)):
@@ -199,11 +202,9 @@ def _running_mean(values: Array, duration_s: Array, window_s: float, alike: Arra
         while first < k and spent - float(duration_s[first]) >= window_s * (1.0 - 1e-9):
             spent -= float(duration_s[first])
             first += 1
-        part, weight = values[first : k + 1], duration_s[first : k + 1]
-        known = np.isfinite(part)
-        if not known.any():
+        if not weight[k + 1] > weight[first]:
             continue
-        mean = float(np.average(part[known], weights=weight[known]))
+        mean = float((weighted[k + 1] - weighted[first]) / (weight[k + 1] - weight[first]))
         if spent >= window_s * (1.0 - 1e-9):
             out[k] = mean
         elif spent > partial[0]:
