@@ -21,7 +21,7 @@ from twin.rig.keys import load_pair, load_public
 from twin.rig.messages import SamplesHeader
 from twin.rig.wire import TOPIC_SAMPLES, guard_client
 
-GIVEN_UP_S, START_S = 5.0, 60.0
+GIVEN_UP_S, START_S = 30.0, 60.0
 SAMPLE_RATE_HZ, QUIET_S = 50_000.0, 1.0
 BUDGETS_W = (0.5, 0.8, 0.4, 1.0)
 """So little that gains must change."""

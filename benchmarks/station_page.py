@@ -19,7 +19,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.station_processes import Station, station
 from twin.station.doctor import find_browser
 
-GIVEN_UP_S = 10.0
+GIVEN_UP_S = 30.0
 FLAGS = ["--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
 LISTEN = """() => {
   window.redraws = []; window.completes = [];
