@@ -141,6 +141,28 @@ def test_another_wish_on_a_long_way_is_heard() -> None:
     assert made.idle_at[1] == pytest.approx(1.5)
 
 
+def test_a_recording_that_begins_late_is_jumped_about_in_all_the_same() -> None:
+    made = bench()
+    late, seek = 8_000, made.tape.seek
+
+    def step() -> Any:
+        made.tape.position = max(made.tape.position, late)
+        return Tape.step(made.tape)
+
+    def seek_late(time_s: float) -> None:
+        was = made.tape.position
+        seek(time_s)
+        if made.tape.position <= late:  # nothing lies before: the position stays what it was, or the start
+            made.tape.position = min(was, 0)
+
+    made.tape.step, made.tape.seek = step, seek_late  # type: ignore[method-assign]
+    made.when_idle = [Wish("seek", 8.0), Wish("seek", 14.0), Wish("pause")]
+    made.run({20: Wish("pause")})
+    assert made.shown[:21] == [*steps(8.0, 20), 8.0]
+    assert made.shown[21:31] == steps(13.0, 10)
+    assert made.playback.state()["begin_s"] == 8.0
+
+
 def test_after_the_end_it_plays_again_but_finishes_once() -> None:
     made = bench()
     made.when_idle = [Wish("play")]

@@ -71,7 +71,7 @@ class Playback:
         self._stop_s, self._length_s = to_s, n_samples / sample_rate_hz
         self.speed, self.playing, self.ended, self.seeking = speed, True, False, False
         self.jumps = 0
-        self._block_s = FIRST_GUESS_S
+        self._block_s, self._begin_s = FIRST_GUESS_S, math.inf
         self._seekable, self._jumped = seekable, jumped
         self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
         self._due: tuple[float, float] | None = None
@@ -101,6 +101,7 @@ class Playback:
         """What the page shows of it."""
         return {
             "position_s": round(self._player.time_s, 4),
+            "begin_s": round(self._begin_s, 4) if math.isfinite(self._begin_s) else 0.0,
             "length_s": round(self._length_s, 4),
             "playing": self.playing,
             "speed": self.speed,
@@ -149,7 +150,7 @@ class Playback:
         if frame is None:
             self.playing, self.ended, self._stop_s = False, True, None
             return
-        self._block_s = frame.block.n_samples / self._rate
+        self._note(frame)
         take(frame)
         if self.speed <= 0.0:
             return
@@ -208,7 +209,10 @@ class Playback:
             if before_s < player.time_s:
                 player.seek(before_s)
             while player.time_s + SEEK_STEP_S < before_s and self._wishes.empty():
-                player.seek(player.time_s + SEEK_STEP_S)
+                at_s = player.time_s
+                player.seek(at_s + SEEK_STEP_S)
+                if player.time_s == at_s:
+                    break  # nothing lies there: the recording begins later, or has a gap
             if self._wishes.empty():
                 player.seek(before_s)
             else:
@@ -217,10 +221,16 @@ class Playback:
                 )  # far enough: somewhere else is wanted
             self._jumped()
             while self._fits(target_s) and (frame := player.step()) is not None:
-                self._block_s = frame.block.n_samples / self._rate
+                self._note(frame)
                 take(frame)
         finally:
             self.seeking = False
+
+    def _note(self, frame: Frame) -> None:
+        """Learn how long blocks are, and where the recording begins: a rig may have run long before its station."""
+        block = frame.block
+        self._block_s = block.n_samples / self._rate
+        self._begin_s = min(self._begin_s, block.start_s)
 
     def _fits(self, end_s: float) -> bool:
         """Whether another block ends by then."""

@@ -23,6 +23,7 @@ export function showPlayer(p) {
   playing = p.playing;
   put("play", playing ? "Pause" : p.ended ? "Play again" : "Play");
   const seek = $("seek");
+  seek.min = String(p.begin_s);
   seek.max = String(p.length_s);
   seek.disabled = !p.seekable;
   seek.setAttribute("aria-valuetext", `${p.position_s.toFixed(1)} of ${p.length_s.toFixed(1)} seconds`);
