@@ -5,7 +5,6 @@ In the coordinates of its own modes (pairs of states that know nothing of the ot
 products per state instead of n; all else has no memory and is worked out for many samples at once.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from estimators.kernels import COUNT, LAGGED, NIS, NORMALISED, PAIRS, PREDICTION, SQUARES, SUM, VARIANCES
 from twin.plant.compiled import kernel
 from twin.plant.linear import Array, read_only
+from twin.plant.modal import inverse_of_shapes, modal_recursion, modes
 from twin.plant.stretches import STRETCH, add_product
 
 WORST_CONDITION = 1e5
@@ -90,8 +90,8 @@ def steady_filter(
     of_signals = gain @ innovation_of_signals
     of_signals[:, :m] += B0
     of_signals[:, m : 2 * m] += B1
-    scaled_shapes, blocks = _modes(closed / scale[:, None] * scale)
-    back = _inverse_of_sound(scaled_shapes, worst_condition)
+    scaled_shapes, blocks = modes(closed / scale[:, None] * scale)
+    back = inverse_of_shapes(scaled_shapes, worst_condition)
     separate = back is not None
     if back is None:
         scaled_shapes, back, blocks = np.eye(n), np.eye(n), np.zeros((0, 4))
@@ -113,70 +113,6 @@ def steady_filter(
         normalised_of_signals=read_only(whitening @ innovation_of_signals),
         root=read_only(root),
     )
-
-
-def _inverse_of_sound(shapes: Array, worst_condition: float) -> Array | None:
-    """Inverse of shapes that can be told apart: condition number in Frobenius' norm, at least that in the 2-norm."""
-    try:
-        inverse = np.linalg.inv(shapes)
-    except np.linalg.LinAlgError:
-        return None
-    condition = math.sqrt(float(np.vdot(shapes, shapes)) * float(np.vdot(inverse, inverse)))
-    return np.asarray(inverse) if condition <= worst_condition else None
-
-
-def _modes(A: Array) -> tuple[Array, Array]:
-    """Real shapes (n, n) and blocks (ceil(n / 2), 4): complex modes first, then real ones two and two."""
-    values, vectors = np.linalg.eig(A)
-    upper, real = np.flatnonzero(values.imag > 0.0), np.flatnonzero(values.imag == 0.0)
-    shapes = [part for j in upper for part in (vectors[:, j].real, vectors[:, j].imag)]
-    blocks = [(values[j].real, values[j].imag, -values[j].imag, values[j].real) for j in upper]
-    shapes += [vectors[:, j].real for j in real]
-    own = [float(values[j].real) for j in real] + [0.0] * (len(real) % 2)
-    blocks += [(a, 0.0, 0.0, d) for a, d in zip(own[::2], own[1::2], strict=True)]
-    return np.column_stack(shapes), np.array(blocks)
-
-
-@kernel
-def modal_recursion(pairs: Array, y: Array, count: int) -> None:
-    """``y[:, k] <- A y[:, k-1] + y[:, k]`` for k = 1 .. count, in place, A block-diagonal.
-
-    Every step waits for the one before, but not for those of other pairs: four pairs, or two, take turns.
-
-    Parameters
-    ----------
-    pairs
-        (n_y / 2, 4) blocks, an even number of them.
-    y
-        (n_y, count + 1 or more), the start in column 0.
-    """
-    n, b = len(pairs), 0
-    while b + 4 <= n:
-        a0, b0, c0, d0 = pairs[b, 0], pairs[b, 1], pairs[b, 2], pairs[b, 3]
-        a1, b1, c1, d1 = pairs[b + 1, 0], pairs[b + 1, 1], pairs[b + 1, 2], pairs[b + 1, 3]
-        a2, b2, c2, d2 = pairs[b + 2, 0], pairs[b + 2, 1], pairs[b + 2, 2], pairs[b + 2, 3]
-        a3, b3, c3, d3 = pairs[b + 3, 0], pairs[b + 3, 1], pairs[b + 3, 2], pairs[b + 3, 3]
-        r = 2 * b
-        p0, q0, p1, q1 = y[r, 0], y[r + 1, 0], y[r + 2, 0], y[r + 3, 0]
-        p2, q2, p3, q3 = y[r + 4, 0], y[r + 5, 0], y[r + 6, 0], y[r + 7, 0]
-        for k in range(1, count + 1):
-            p0, q0 = (y[r, k] + a0 * p0) + b0 * q0, (y[r + 1, k] + c0 * p0) + d0 * q0
-            p1, q1 = (y[r + 2, k] + a1 * p1) + b1 * q1, (y[r + 3, k] + c1 * p1) + d1 * q1
-            p2, q2 = (y[r + 4, k] + a2 * p2) + b2 * q2, (y[r + 5, k] + c2 * p2) + d2 * q2
-            p3, q3 = (y[r + 6, k] + a3 * p3) + b3 * q3, (y[r + 7, k] + c3 * p3) + d3 * q3
-            y[r, k], y[r + 1, k], y[r + 2, k], y[r + 3, k] = p0, q0, p1, q1
-            y[r + 4, k], y[r + 5, k], y[r + 6, k], y[r + 7, k] = p2, q2, p3, q3
-        b += 4
-    while b < n:
-        a0, b0, c0, d0 = pairs[b, 0], pairs[b, 1], pairs[b, 2], pairs[b, 3]
-        a1, b1, c1, d1 = pairs[b + 1, 0], pairs[b + 1, 1], pairs[b + 1, 2], pairs[b + 1, 3]
-        r = 2 * b
-        p0, q0, p1, q1 = y[r, 0], y[r + 1, 0], y[r + 2, 0], y[r + 3, 0]
-        for k in range(1, count + 1):
-            p0, q0 = (y[r, k] + a0 * p0) + b0 * q0, (y[r + 1, k] + c0 * p0) + d0 * q0
-            p1, q1 = (y[r + 2, k] + a1 * p1) + b1 * q1, (y[r + 3, k] + c1 * p1) + d1 * q1
-            y[r, k], y[r + 1, k], y[r + 2, k], y[r + 3, k] = p0, q0, p1, q1
-        b += 2
 
 
 @kernel

@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 
 from twin.plant.blocks import Block, Channel, make_block
 from twin.plant.config import DampingTable, ForceActuator, Plant, Sensor
+from twin.plant.discrete import simulate_block
 from twin.plant.files import load_plant
 from twin.plant.inputs import DampedModels, DriveReader, InputSource, choose_inputs, driven_model
+from twin.plant.modal import modal_model
 from twin.plant.parallel import ParallelPlant
 
 RATE_HZ = 50_000.0
@@ -167,3 +169,27 @@ def test_models_follow_what_other_bodies_lose_at_another_frequency() -> None:
         np.testing.assert_allclose(models.at(3.0, frequency_hz)[0].A, fresh.A, rtol=1e-13)
     with pytest.raises(ValueError, match="no absorber"):
         DampedModels(load_plant("shaker_v721"), sources, 50_000.0)
+
+
+@pytest.mark.parametrize("preset", ["rig", "engine_vcm"])
+def test_plant_in_its_modes_is_the_plant_whatever_the_blocks_and_while_its_damping_moves(preset: str) -> None:
+    plant = load_plant(preset)
+    names = tuple(a.name for a in plant.actuator)
+    sources = choose_inputs(plant, names)
+    models = DampedModels(plant, sources, RATE_HZ)
+    rng = np.random.default_rng(4)
+    values = np.cumsum(rng.standard_normal((3000, len(names))), axis=0)
+    wanted = [s.name for s in plant.sensor if s.kind in ("acceleration", "current")][::-1]
+    model, discrete = models.at(7.0, 50.0)
+    parallel = ParallelPlant(DriveReader(sources, names), model, discrete, wanted)
+    rows = [model.outputs.index(name) for name in wanted]
+    assert modal_model(discrete, discrete.C[rows], discrete.D[rows]) is not None
+    x, before = np.zeros(len(model.states)), values[0].copy()
+    for k, (first, end) in enumerate(((0, 1), (1, 120), (120, 1000), (1000, 1241), (1241, 3000))):
+        model, discrete = models.at(7.0 + k, 50.0)
+        parallel.set_model(discrete)
+        expected = np.empty((end - first, len(rows)))
+        d = discrete
+        simulate_block(d.F, d.B0, d.B1, d.C[rows], d.D[rows], x, before, values[first:end], expected)
+        found = parallel.advance(block_of(first, values[first:end], names))
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10 * np.abs(expected).max())

@@ -4,18 +4,13 @@ Questions go to a `Tuner`; here is only compared and counted. What is decided de
 blocks at which answers came, all of which are recorded, so that a replay repeats it.
 """
 
-import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-
-import numpy as np
 
 from estimators.damping import DampingLearner
 from estimators.types import DampingCurve, Phasors
 from tuning.retune import TuningGoal
 from tuning.stability import Instability
-from tuning.step import stiffness_terms
 from tuning.types import Proposal
 from twin.control.schedule import Acknowledgement, Command, Gains, GainSchedule
 from twin.plant.blocks import Block
@@ -23,62 +18,19 @@ from twin.plant.config import Plant
 from twin.station.advice import Answer, Question
 from twin.station.frame import STANDS, UNCHANGED, Decision, Event
 from twin.station.orders import Order, Ordered
+from twin.station.retuning_rules import COMMAND_LEAD_BLOCKS, ReferenceGrowth, RetuningSettings, StepJudge
 from twin.station.worker import Arrival, Tuner
 
-COMMAND_LEAD_BLOCKS = 2
-"""A command is due this many blocks after the one that led to it: time for it to reach the rig."""
+__all__ = ["Retuning", "RetuningSettings", "Standing", "Turn"]
 
 FORGOTTEN_BLOCKS = 20
 """A command that the rig has neither obeyed nor refused after this many blocks is no longer waited for."""
-
-GROWTH_BLOCKS = 10
-"""Growth is measured over so many blocks."""
 
 ORDER_LEAD_BLOCKS = 1
 """What the operator orders is due sooner: a block."""
 
 STANDING = 60
 """So many proposals may wait for the operator; the oldest go."""
-
-MAX_AHEAD_HZ = 3.0
-"""A jump of the excitation is no sweep: no more of the table than this is retuned ahead of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class RetuningSettings:
-    """When gains are asked for, and which of them become commands.
-
-    Attributes
-    ----------
-    every_blocks
-        How often proposals are asked for, if the last answer is there and no command on its way.
-    lag_blocks
-        Blocks from question to answer where the data can wait for the twin; a live rig takes answers as they come.
-    outdated_ns_m
-        A proposal is dropped if the damping in use at one of its points has moved this far since the question.
-    min_change
-        A point's gains are worth a command if one of the law's terms moves by this share of the table's largest.
-    reversal
-        And by so many times more where they would turn back on their last step: estimates scatter, plants drift.
-    longest_step
-        How far one command may move any of the law's terms, as a share of the absorber's stiffness.
-    only_if_unstable
-        Keep the gains in use for as long as they are stable.
-    only_if_growing_1_s
-        And, with that, until the coil's current reference is seen to grow this fast; 0 does not wait for it.
-    approve
-        Proposals stand until the operator accepts them: nothing becomes a command by itself.
-    """
-
-    every_blocks: int = 5
-    lag_blocks: int = 1
-    outdated_ns_m: float = 0.6
-    min_change: float = 1e-3
-    reversal: float = 4.0
-    longest_step: float = 0.2
-    only_if_unstable: bool = False
-    only_if_growing_1_s: float = 0.0
-    approve: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +112,9 @@ class Retuning:
         self._on_its_way: int | None = None
         self._way_blocks = 0
         self._open: Question | None = None
-        self._last_step: dict[int, tuple[float, ...]] = {}
+        self._judge = StepJudge(settings)
         self._unstable: Instability | None = None
-        self._reference_rms: deque[float] = deque(maxlen=GROWTH_BLOCKS)
-        self._block_s = 0.1
+        self._growth = ReferenceGrowth()
 
     def warm_up(self, plant: Plant) -> None:
         """Make the tuner ready; may take seconds."""
@@ -216,8 +167,7 @@ class Retuning:
             Why the model must not be relied on at present; nothing is proposed then.
         """
         last = block.end_sample - 1
-        self._block_s = block.n_samples / block.sample_rate_hz
-        self._reference_rms.append(reference_rms)
+        self._growth.add(reference_rms, block.n_samples / block.sample_rate_hz)
         arrival = self.tuner.take(last)
         done = Turn() if arrival is None else self._decide(block, arrival, plant(), doubt)
         self._since_question += 1
@@ -229,7 +179,7 @@ class Retuning:
             and self._on_its_way is None
             and self.tuner.ready(last)
         ):
-            f, ahead = phasors.frequency_hz, self._look_ahead(moved_hz)
+            f, ahead = phasors.frequency_hz, self.settings.look_ahead_hz(moved_hz)
             std = learner.std_at(f)
             propose = (
                 not doubt and curve.status != "unestimated" and self._is_near(f, ahead) and self._is_wanted()
@@ -245,15 +195,9 @@ class Retuning:
         settings = self.settings
         if not settings.only_if_unstable:
             return True
-        seen = settings.only_if_growing_1_s <= 0.0 or self._growth_1_s() >= settings.only_if_growing_1_s
+        wanted = settings.only_if_growing_1_s
+        seen = wanted <= 0.0 or self._growth.rate_1_s >= wanted
         return self._unstable is not None and seen
-
-    def _growth_1_s(self) -> float:
-        """Rate at which the coil's current reference grew over the last blocks [1/s]."""
-        rms = self._reference_rms
-        if len(rms) < GROWTH_BLOCKS or min(rms) <= 0.0:
-            return 0.0
-        return float(np.polyfit(np.arange(len(rms)) * self._block_s, np.log(rms), 1)[0])
 
     def _question(
         self,
@@ -302,7 +246,11 @@ class Retuning:
         verdict = doubt or infeasible or self._outdated(question, proposal, plant)
         steps: dict[int, Gains] = {}
         if not verdict:
-            steps = {row: gains for row, gains in answer.steps if self._is_worth_it(row, gains)}
+            steps = {
+                row: gains
+                for row, gains in answer.steps
+                if self._judge.is_worth_it(self.schedule, row, gains)
+            }
             verdict = "" if steps else UNCHANGED
         if not verdict and (self._on_its_way is not None or self._ramp):
             verdict = "outdated: the operator's command is on its way"
@@ -319,8 +267,7 @@ class Retuning:
             )
         schedule = self.schedule.with_points(steps)
         command = self._command(block, COMMAND_LEAD_BLOCKS, schedule, question.plant)
-        for row, gains in steps.items():
-            self._last_step[row] = self._step(row, gains)
+        self._judge.taken(self.schedule, steps)
         decision = Decision(last, True, "automatic", "verified and better")
         return Turn(proposal=proposal, decision=decision, command=command, events=tuple(events))
 
@@ -378,8 +325,7 @@ class Retuning:
             return None, f"refused: {verdict}"
         self.standing.clear()
         schedule = self.schedule.with_points(dict(standing.steps))
-        for row, gains in standing.steps.items():
-            self._last_step[row] = self._step(row, gains)
+        self._judge.taken(self.schedule, standing.steps)
         command = self._command(block, ORDER_LEAD_BLOCKS, schedule, standing.question.plant)
         return command, f"proposal {number} accepted"
 
@@ -456,34 +402,7 @@ class Retuning:
         self.outdated += bool(reason)
         return reason
 
-    def _look_ahead(self, moved_hz: float) -> float:
-        """How far the excitation moves until the proposal after this one takes effect [Hz]."""
-        blocks = self.settings.every_blocks + self.settings.lag_blocks + COMMAND_LEAD_BLOCKS + 1
-        return min(max(moved_hz * blocks, -MAX_AHEAD_HZ), MAX_AHEAD_HZ)
-
     def _is_near(self, frequency: float, ahead: float) -> bool:
         low, high = sorted((frequency, frequency + ahead))
         table, reach = self.schedule.frequency_hz, self.goal.reach_hz
         return low - reach <= table[-1] and table[0] <= high + reach
-
-    def _is_worth_it(self, row: int, gains: Gains) -> bool:
-        """Whether a point's step stands out from the table, more so where it would undo the last one."""
-        step = self._step(row, gains)
-        before = self._last_step.get(row, step)
-        turns_back = sum(a * b for a, b in zip(step, before, strict=True)) < 0.0
-        least = self.settings.min_change * (self.settings.reversal if turns_back else 1.0)
-        return max(map(abs, step)) > least
-
-    def _step(self, row: int, gains: Gains) -> tuple[float, ...]:
-        """Change of the law's terms and cutoffs at a point of the table, as shares of the largest there."""
-        s = self.schedule
-        w = math.tau * np.array(s.frequency_hz)
-        table = np.stack([np.array(s.alpha_kg) * w**2, np.array(s.beta_ns_m) * w, np.array(s.gamma_n_m)])
-        largest = float(np.abs(table).max()) or 1.0
-        new = stiffness_terms(gains, s.frequency_hz[row])
-        terms = [(after - float(before)) / largest for before, after in zip(table[:, row], new, strict=True)]
-        cutoffs = [
-            gains.low_pass_hz / s.low_pass_hz[row] - 1.0,
-            gains.high_pass_hz / s.high_pass_hz[row] - 1.0,
-        ]
-        return (*terms, *cutoffs)
