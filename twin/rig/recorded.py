@@ -25,6 +25,9 @@ HELD_BYTES = 256_000_000
 """Raw blocks up to so much stay in memory once read, if asked: a minute at 50 kS/s is read once and not twice."""
 
 
+_UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)
+
+
 class NotOursError(InputError):
     """A Rerun file of another program."""
 
@@ -103,7 +106,7 @@ class Recording:
         InputError
             At a block whose checksum is wrong.
         """
-        found = self._blocks_in_file(from_sample)
+        found = self._in_words(self._blocks_in_file(from_sample))
         if self._in_order:
             return found
         return iter(sorted(found, key=lambda block: block.first_sample))
@@ -122,6 +125,18 @@ class Recording:
     def notes(self, kind: str) -> tuple[tuple[int, str], ...]:
         """(sample, JSON) of every note of that kind, by sample; empty if there is none."""
         return tuple(self._notes.get(kind, ()))
+
+    def _in_words(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Say it where a block's description, which no checksum covers, has become another."""
+        try:
+            yield from blocks
+        except _UNREADABLE as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{self.path}: a block's description is damaged ({error}); use another copy of the file, or leave the "
+                "block out with 'atmd recordings repair'"
+            ) from error
 
     def _blocks_in_file(self, from_sample: int) -> Iterator[Block]:
         for batch in self._batches():
@@ -247,11 +262,14 @@ def blocks_are_whole(recording: Recording, found: Rows) -> bool:
     batch = found.batch
     if batch is None or found.entity != f"/{ROOT}/raw":
         return batch is not None
-    firsts, times = (batch.column(name).cast(pa.int64()).to_pylist() for name in ("sample", "time"))
-    return all(
-        _is_whole(first, time_ns, cell.as_py()[0], recording.sample_rate_hz, len(recording.channels))
-        for first, time_ns, cell in zip(firsts, times, batch.column("block"), strict=True)
-    )
+    try:
+        firsts, times = (batch.column(name).cast(pa.int64()).to_pylist() for name in ("sample", "time"))
+        return all(
+            _is_whole(first, time_ns, cell.as_py()[0], recording.sample_rate_hz, len(recording.channels))
+            for first, time_ns, cell in zip(firsts, times, batch.column("block"), strict=True)
+        )
+    except _UNREADABLE:
+        return False
 
 
 def _is_whole(first: int, time_ns: int, row: dict[str, Any], rate_hz: float, n_channels: int) -> bool:
@@ -294,7 +312,7 @@ def _open_file(path: Path, hold_bytes: int) -> Recording:
         return _scan(path, hold_bytes)
     except InputError:
         raise
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+    except _UNREADABLE as error:
         raise InputError(
             f"{path}: is damaged and nothing in it can be recovered ({error}); use another copy"
         ) from error
