@@ -115,6 +115,11 @@ class _Variant:
         opened = open_any(self.path, ReplayOptions(plant=self.plant))
         if self.as_it_was:
             return opened
+        if opened.settings.loop is None and (self.budget_w is not None or self.modulus_margin is not None):
+            raise InputError(
+                f"{self.path}: says nothing of the rig's controller, so that there is nothing to tune: budgets_w and "
+                "modulus_margins do nothing here; leave this recording out of archive.recordings"
+            )
         goal = opened.settings.goal
         if self.budget_w is not None:
             goal = replace(goal, budget_w=self.budget_w, budget_kind=self.kind)
