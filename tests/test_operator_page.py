@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+import psutil
 import pytest
+from garbage import spoiled
 
 from tuning.retune import TuningGoal
 from twin.control.schedule import Acknowledgement, Command
@@ -456,6 +458,9 @@ def test_a_recording_takes_no_orders() -> None:
 # --- garbage -----------------------------------------------------------------------------------------------
 
 
+FRAMES, REQUESTS = 98_000, 2_000
+
+
 def throw_garbage(page: OperatorPage, count: int, seed: int = 4) -> None:
     """Random bytes, half-right requests and cut-off ones, on many short connections."""
     rng = random.Random(seed)
@@ -478,7 +483,7 @@ def throw_garbage(page: OperatorPage, count: int, seed: int = 4) -> None:
         elif kind == 3:
             data = good[: rng.randrange(len(good))]
         try:
-            if raw is None or k % 10 == 0:
+            if raw is None or k % 40 == 0:
                 if raw is not None:
                     raw.close()
                 raw = socket.create_connection(("127.0.0.1", place.port or 0), timeout=5.0)
@@ -491,11 +496,98 @@ def throw_garbage(page: OperatorPage, count: int, seed: int = 4) -> None:
         raw.close()
 
 
-def test_random_frames_at_the_page_order_nothing_and_stop_nothing(page: OperatorPage, made: Bench) -> None:
-    made.run()
+def ask_nonsense(page: OperatorPage, count: int, seed: int = 5) -> dict[int, int]:
+    """Requests that are HTTP and make no sense: whose, where to and what; returns how often each status came."""
+    rng = random.Random(seed)
+    place = urlsplit(page.url)
+    known = {"Cookie": cookie(page).split(";")[0], "Origin": origin(page), "Content-Type": "application/json"}
+    bodies: dict[str, dict[str, Any]] = {
+        "arm": {"proposal": 1, "seen_sample": 5}, "send": {"proposal": 1, "seen_sample": 5, "code": "0" * 16},
+        "revert": {"seen_sample": 5}, "on": {"seen_sample": 5}, "review": {"standing": 10**6},
+    }  # fmt: skip
+    found: dict[int, int] = {}
+    connection = http.client.HTTPConnection("127.0.0.1", place.port, timeout=60.0)
+    for _ in range(count):
+        what = rng.choice(list(bodies))
+        headers = dict(known)
+        method, path, body = "POST", f"/api/{what}", spoiled(rng, bodies[what])
+        match rng.randrange(6):
+            case 0:
+                del headers[rng.choice(list(headers))]
+            case 1:
+                headers[rng.choice(list(headers))] = "".join(chr(rng.randrange(33, 255)) for _ in range(30))
+            case 2:
+                method, path = rng.choice(["PUT", "DELETE", "GET", "PATCH"]), f"/api/{rng.getrandbits(40):x}"
+            case 3:
+                body = b"x" * 17_000
+        try:
+            if connection.sock is None:
+                connection.connect()
+                connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+            answer.read()
+            found[answer.status] = found.get(answer.status, 0) + 1
+        except (OSError, http.client.HTTPException):
+            connection.close()
+            found[0] = found.get(0, 0) + 1
+    connection.close()
+    return found
+
+
+def test_hundred_thousand_random_frames_at_the_page_order_nothing_and_stop_nothing(
+    page: OperatorPage, made: Bench
+) -> None:
+    while seen(made) < 300_000:  # what was seen at sample 5 is old by then
+        made.run()
     sent = len(made.sent)
-    throw_garbage(page, 3000)
+    made.desk.remarks()
+    refused_before, rss_before = made.desk.refused_in_all, psutil.Process().memory_info().rss
+    over, remarks, frames = threading.Event(), [], 0
+
+    def loop() -> None:
+        """The loop goes on meanwhile, as at a rig."""
+        nonlocal frames
+        while not over.is_set():
+            made.run()
+            frames += 1
+            remarks.extend(made.desk.remarks())
+            over.wait(0.1)
+
+    beside = threading.Thread(target=loop)
+    beside.start()
+    try:
+        throw_garbage(page, FRAMES)
+        statuses = ask_nonsense(page, REQUESTS)
+    finally:
+        over.set()
+        beside.join()
+    assert frames > 10
     assert made.desk.order() is None
-    made.run(3)
     assert len(made.sent) == sent
+    assert not any(200 <= status < 400 for status in statuses), statuses
+    assert all(status < 500 for status in statuses), statuses
+    assert {401, 403, 413, 415, 422} <= set(statuses)
+    assert (
+        made.desk.refused_in_all - refused_before > 0.7 * REQUESTS
+    )  # the rest was no HTTP, or told of what is not there
+    assert 0 < len(remarks) < 400
+    assert psutil.Process().memory_info().rss - rss_before < 150e6
     assert post(page, "/api/whatif", changes={}).status == 200
+
+
+def test_page_ends_at_once_and_without_a_word_while_a_browser_listens(
+    made: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    made.run()
+    with OperatorPage(made.desk) as page:
+        place = urlsplit(page.url)
+        listening = http.client.HTTPConnection("127.0.0.1", place.port, timeout=60.0)
+        listening.request("GET", "/api/stream", headers={"Cookie": cookie(page).split(";")[0]})
+        answer = listening.getresponse()
+        assert answer.read1(100)
+    assert caplog.records == []
+    assert not page._thread.is_alive()
+    while answer.read1(10_000):
+        pass
+    listening.close()
