@@ -208,7 +208,9 @@ class Arrivals:
             raise RunError(
                 f"the rig was away for {missing / block.sample_rate_hz:.0f} s; start again for a new recording"
             )
-        self.counts.lost += -(-missing // block.n_samples)  # all at once: they are one loss, and one word about it
+        self.counts.lost += -(
+            -missing // block.n_samples
+        )  # all at once: they are one loss, and one word about it
         while first < block.first_sample:
             n = min(block.n_samples, block.first_sample - first)
             empty = np.full((n, len(block.channels)), np.nan)

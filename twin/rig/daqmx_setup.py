@@ -112,9 +112,9 @@ def read_setup(path: Path, plant: Plant) -> tuple[DaqmxSetup, tuple[Input, ...]]
         )
     found = []
     for name, unit in units.items():
-        place = setup.channels.get(name)
-        if place is None:
+        if name not in setup.channels:
             continue
+        place = setup.channels[name]
         factor = sensitivity_to_si("V", place.sensitivity, unit)
         if factor is None:
             raise InputError(

@@ -134,7 +134,9 @@ class FilePipe:
         # A process forked meanwhile may hold the pipe open, so an end of file need not come: hence `_closing`.
         synced, dirty = time.monotonic(), False
         while True:
-            closing = self._closing  # before looking: what the writer wrote until then is then still to be seen
+            closing = (
+                self._closing
+            )  # before looking: what the writer wrote until then is then still to be seen
             due = max(0.0, synced + SYNC_S - time.monotonic()) if dirty else _POLL_S
             ready, _, _ = select.select([self._outlet], [], [], due)
             since = time.monotonic() - synced

@@ -194,7 +194,10 @@ def _guesses(
         contested = [r for r in rivals if called and len(_words(r) & _words(called[0])) >= best]
         if len(called) == 1 and not contested:
             shared = ", ".join(sorted(_words(name) & _words(called[0])))
-            found[name] = (called[0], f"the only array in {stated[called[0]]} that is called '{shared}' like it")
+            found[name] = (
+                called[0],
+                f"the only array in {stated[called[0]]} that is called '{shared}' like it",
+            )
     taken = [array for array, _ in found.values()]
     return {name: (array, why) for name, (array, why) in found.items() if taken.count(array) == 1}
 

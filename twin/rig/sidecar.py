@@ -159,7 +159,7 @@ def _ref(place: _Place, where: str) -> ArrayRef:
         unit = f"{place.scale!r} {unit or ''}".strip()
     if place.sensitivity is not None:
         if unit is None:
-            raise InputError(f"{where}: sensitivity needs the unit of what was sampled, such as unit = \"V\"")
+            raise InputError(f'{where}: sensitivity needs the unit of what was sampled, such as unit = "V"')
         unit = f"{unit}@{place.sensitivity}"
     return ArrayRef(ref.array, ref.index, unit)
 
