@@ -52,7 +52,7 @@ MAX_COMMAND_BYTES = 1024 * 1024
 MOST_AT_ONCE = 200
 """Messages read before the rig looks at its samples again: a flood of them must not hold up a block."""
 
-START_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 300.0
 STATION_SILENT_S = 30.0
 HELLO_EVERY_S = 0.02
 HELLO_EVERY_STREAMING_S = 1.0
