@@ -31,9 +31,8 @@ def order_latencies(both: Station, count: int) -> dict[str, list[float]]:
     """[ms] by kind of order: gains sent and taken back, control switched on and off, at any time within a block."""
     out: dict[str, list[float]] = {"send": [], "revert": [], "off": [], "on": []}
     rng = random.Random(3)  # noqa: S311 - moments to press a button, no secret
-    operator = _Operator(both.url)
-    operator.wait_until_followed()
-    with closing(_Blocks(both)) as blocks:
+    with closing(_Operator(both.url)) as operator, closing(_Blocks(both)) as blocks:
+        operator.wait_until_followed()
         blocks.start()
         blocks.heard.wait(START_S)
         for k in range(count):
@@ -129,6 +128,10 @@ class _Operator:
         answer.read()
         self._cookie = (answer.getheader("set-cookie") or "").split(";")[0]
         self._origin = f"http://{place.netloc}"
+
+    def close(self) -> None:
+        """Hang up."""
+        self._connection.close()
 
     def state(self) -> dict[str, Any]:
         """What the page shows."""

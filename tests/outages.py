@@ -193,7 +193,11 @@ class Everything:
             with contextlib.suppress(OSError, http.client.HTTPException, KeyError):
                 place = urlsplit(str(self.page.state["viewer_url"]))
                 connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=5.0)
-                connection.request("GET", "/")
+                connection.request("GET", f"/?{place.query}")
+                welcome = connection.getresponse()
+                cookie = (welcome.getheader("set-cookie") or "").partition(";")[0]
+                welcome.read()
+                connection.request("GET", "/", headers={"Cookie": cookie})
                 target = connection.getresponse().getheader("location") or ""
                 self.stream = parse_qs(urlsplit(target).query)["url"][0]
                 connection.close()

@@ -241,7 +241,8 @@ def test_nan_in_a_channel_is_masked_and_counted(tmp_path: Path) -> None:
         holed = dict(arrays)
     holed["tip_displacement"][100:120] = np.nan
     np.savez(tmp_path / "holed.npz", **holed)
-    done = atmd("replay", "holed.npz", "--plant", "beam", "--sample-rate", "100", "--json", "-", cwd=tmp_path)
+    options = ("--plant", "beam", "--sample-rate", "100", "--yes")
+    done = atmd("replay", "holed.npz", *options, "--json", "-", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["masked_samples"] == 20

@@ -74,7 +74,7 @@ def test_budget_moved_reviewed_sent_obeyed_audited_and_taken_back(
         page.click("#propose")
         page.wait_for_selector("#arm:enabled")
         assert page.locator("#send").is_disabled()
-        assert "4 W joule mean → 0.2" in page.inner_text("#review")
+        assert "4 W mean Joule → 0.2" in page.inner_text("#review")
         page.click("#arm")
         page.wait_for_selector("#send:enabled")
         page.click("#send")
@@ -123,7 +123,7 @@ def test_page_is_usable_by_keyboard_and_on_a_tablet(
             reached.append(page.evaluate("document.activeElement.id"))
         for name in ("off", "budget", "kind", "margin", "propose", "branch"):
             assert name in reached
-        assert page.locator("#status dd").count() == 9
+        assert page.locator("#status dd").count() == 11
         browser.close()
 
 

@@ -47,20 +47,35 @@ class NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
-def get(url: str) -> http.client.HTTPResponse:
+def get(url: str, cookie: str = "") -> http.client.HTTPResponse:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), NoRedirect())
     try:
+        opener.addheaders = [("Cookie", cookie)]
         return opener.open(url, timeout=10.0)
     except urllib.error.HTTPError as error:
         return error
 
 
-def raw_get(url: str, path: str, host: str | None = None) -> int:
+def get_file(url: str, name: str) -> http.client.HTTPResponse:
+    return get(f"http://{urlsplit(url).netloc}/{name}", cookie_of(url))
+
+
+def cookie_of(url: str) -> str:
+    with get(url) as answer:
+        assert answer.status == 303
+        cookie, _, rest = answer.headers["Set-Cookie"].partition(";")
+    assert "httponly" in rest.lower()
+    assert "samesite=strict" in rest.lower()
+    return cookie
+
+
+def raw_get(url: str, path: str, host: str | None = None, cookie: str = "") -> int:
     place = urlsplit(url)
     connection = http.client.HTTPConnection(place.hostname, place.port, timeout=10.0)
     connection.putrequest("GET", path, skip_host=host is not None)
     if host is not None:
         connection.putheader("Host", host)
+    connection.putheader("Cookie", cookie)
     connection.endheaders()
     status = connection.getresponse().status
     connection.close()
@@ -68,8 +83,7 @@ def raw_get(url: str, path: str, host: str | None = None) -> int:
 
 
 def test_the_first_page_opens_the_viewer_on_the_stream(served: tuple[str, rr.RecordingStream]) -> None:
-    url, _ = served
-    with get(url) as answer:
+    with get_file(served[0], "") as answer:
         assert answer.status == 307
         target = urlsplit(answer.headers["Location"])
     assert target.path == "/index.html"
@@ -90,7 +104,7 @@ def test_files_come_with_their_type_and_a_policy(
     served: tuple[str, rr.RecordingStream], name: str, kind: str, least: int
 ) -> None:
     url, _ = served
-    with get(url + name) as answer:
+    with get_file(url, name) as answer:
         assert answer.headers["Content-Type"].startswith(kind)
         assert int(answer.headers["Content-Length"]) > least
         policy = dict(rule.split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split("; "))
@@ -117,7 +131,13 @@ def test_files_come_with_their_type_and_a_policy(
 )
 def test_nothing_else_is_served(served: tuple[str, rr.RecordingStream], path: str) -> None:
     url, _ = served
-    assert raw_get(url, path) == 404
+    assert raw_get(url, path, cookie=cookie_of(url)) == 404
+
+
+@pytest.mark.parametrize("path", ["/", "/index.html", "/re_viewer_bg.wasm", "/?token=guessed"])
+def test_nothing_is_served_without_the_token(served: tuple[str, rr.RecordingStream], path: str) -> None:
+    assert raw_get(served[0], path) == 401
+    assert raw_get(served[0], path, cookie=cookie_of(served[0]) + "x") == 401
 
 
 def test_a_page_that_pretends_to_be_this_machine_is_refused(served: tuple[str, rr.RecordingStream]) -> None:

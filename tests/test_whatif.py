@@ -443,7 +443,7 @@ def test_command_answers_for_a_plant_and_for_an_instant_of_a_recording(tmp_path:
         (WhatIfOptions(plant="rig", band="x"), "--band x"),
         (WhatIfOptions(plant="rig", band="50,49"), "must rise"),
         (WhatIfOptions(file=Path("no.npz")), "needs a recording of this program"),
-        (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 3.9 s"),
+        (WhatIfOptions(file=TEST_3_RECORDING, at_s=9.0), "lasts from 0 to 4 s"),
         (WhatIfOptions(plant="rig", settings=("gamma_n_m=x",)), "no number in N/m"),
         (WhatIfOptions(plant="rig", settings=("beta_ns_m=-7@0",)), "above 0 Hz"),
         (WhatIfOptions(plant="rig", settings=("beta_ns_m=-7@48", "beta_ns_m=-8@48")), "given twice"),

@@ -34,6 +34,15 @@ class AlarmWatch:
     kind: BudgetKind = "joule_mean"
     _spent: deque[float] = field(default_factory=lambda: deque(maxlen=POWER_BLOCKS))
 
+    @property
+    def spent_w(self) -> float:
+        """Mean power of the latest blocks [W]; NaN before the first."""
+        return sum(self._spent) / len(self._spent) if self._spent else math.nan
+
+    def restart(self) -> None:
+        """Forget the blocks before: a recording jumped."""
+        self._spent.clear()
+
     def take(self, performance: Performance | None) -> tuple[AlarmState, str]:
         """Return the worst of a block's alarms and what it is in words; ``none`` and nothing where all is well."""
         p, coil = performance, self.plant.voice_coil
@@ -44,7 +53,7 @@ class AlarmWatch:
         limit = self.plant.limits.get(f"{coil.name}_current_a", math.inf)
         if p.current_peak_a > AT_LIMIT * limit:
             return "at a limit", f"{coil.name}: {p.current_peak_a:.2f} A, limit {limit:g} A"
-        spent = sum(self._spent) / len(self._spent)
+        spent = self.spent_w
         if spent > OVER_BUDGET * p.budget_w:
             return "over budget", f"{spent:.3g} W, budget {p.budget_w:.3g} W"
         return "none", ""

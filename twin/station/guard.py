@@ -1,4 +1,4 @@
-"""Who may talk to the operator page: token, Host, Origin and size are checked before anything else sees a request."""
+"""Who may talk to the operator page and its viewer: token, Host, Origin and size are checked before all else."""
 
 import secrets
 from collections.abc import Callable, Collection
@@ -35,6 +35,8 @@ class Guard:
         Name of the cookie; another for every port, since browsers do not tell ports apart.
     refused
         Told of every refusal, in words.
+    framed
+        Other pages may show it in a frame, as far as the policy lets them.
     """
 
     def __init__(
@@ -45,6 +47,8 @@ class Guard:
         policy: str,
         refused: Callable[[str], None],
         cookie: str = "atmd",
+        *,
+        framed: bool = False,
     ) -> None:
         self._cookie = cookie
         self._app, self._token, self._hosts = app, token, frozenset(h.lower() for h in hosts)
@@ -52,11 +56,12 @@ class Guard:
         self._headers = {
             "Content-Security-Policy": policy,
             "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Opener-Policy": "same-origin",
             "Cross-Origin-Resource-Policy": "same-origin",
         }
+        if not framed:
+            self._headers["X-Frame-Options"] = "DENY"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, refuse or pass on."""

@@ -64,7 +64,7 @@ class WhatIfBody(_Body):
 class SeenBody(_Body):
     """An order, and the data its giver was looking at."""
 
-    seen_sample: Annotated[int, Field(ge=0)]
+    seen_sample: Annotated[int, Field(ge=0, le=2**53)]
 
 
 class ReviewBody(_Body):
@@ -392,7 +392,8 @@ class OperatorPage:
 def security_policy(viewer_url: str) -> str:
     """Content security policy: this server alone, and Rerun's viewer in a frame."""
     place = urlsplit(viewer_url)
-    frames = f"{place.scheme}://{place.netloc}" if place.netloc else "'none'"
+    names = dict.fromkeys((place.hostname, "localhost"))
+    frames = " ".join(f"{place.scheme}://{name}:{place.port}" for name in names) if place.netloc else "'none'"
     rules = {
         "default-src": "'none'",
         "script-src": "'self'",
@@ -408,7 +409,9 @@ def security_policy(viewer_url: str) -> str:
 
 
 def _listener(bind: str, port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET)
+    # The protocol is named so that connections send at once: unnamed, asyncio leaves the 40 ms of Nagle's algorithm in.
+    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((bind, port))

@@ -8,14 +8,12 @@ from typing import Any
 from tuning.retune import TuningGoal
 from tuning.types import Powers
 from twin.rig.gateway import RigGateway
+from twin.station.alarms import AlarmState, AlarmWatch
 from twin.station.audit import AuditPoint
 from twin.station.frame import ROUTINE, Frame
 from twin.station.session import Session
 
 LOG_ROWS = 500
-POWER_BLOCKS = 10
-"""Power is shown as the mean of so many blocks: what sensor noise burns differs from one to the next."""
-
 LATELY_S = 60.0
 """Trouble on the wire is worth a mark for so long; the counts stay."""
 
@@ -80,7 +78,7 @@ class Panel:
     state: dict[str, Any] = field(default_factory=dict)
     log: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=LOG_ROWS))
     _seq: int = 0
-    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=POWER_BLOCKS))
+    _watch: AlarmWatch = field(init=False)
     _loads: deque[float] = field(default_factory=lambda: deque(maxlen=20))
     _sent: dict[str, Any] | None = None
     _refusal: dict[str, Any] | None = None
@@ -88,9 +86,12 @@ class Panel:
     _audit: AuditPoint | None = None
     _troubles: tuple[int, float] = (0, -math.inf)
 
+    def __post_init__(self) -> None:
+        self._watch = AlarmWatch(self.session.plant)
+
     def jumped(self, time_s: float) -> None:
         """Forget what does not go on after a jump in a recording."""
-        self._spent.clear()
+        self._watch.restart()
         self._sent, self._audit = None, None
         self.add(time_s, "info", "the replay jumped here")
 
@@ -102,6 +103,9 @@ class Panel:
         if frame.audited is not None:
             self._audit = frame.audited
         goal = session.settings.goal if retuning is None else retuning.goal
+        if goal.budget_kind != self._watch.kind:
+            self._watch = AlarmWatch(session.plant, goal.budget_kind)
+        alarm = self._watch.take(frame.performance)
         length_s = block.n_samples / block.sample_rate_hz
         self._loads.append(in_loop_s / length_s)
         load = sum(self._loads) / len(self._loads)
@@ -130,7 +134,7 @@ class Panel:
             "control_on": block.control_on,
             "excitation_hz": None if frame.phasors is None else finite(frame.phasors.frequency_hz),
             "excitation": self._excitation(frame),
-            "performance": self._performance(frame, goal),
+            "performance": self._performance(frame),
             "goal": goal_figures(goal),
             "approve": None if retuning is None else retuning.approve,
             "standing": self._standing(),
@@ -139,7 +143,7 @@ class Panel:
             "refusal": self._refusal,
             "acknowledged": self._acknowledged,
             "audit": None if self._audit is None else audit_figures(self._audit),
-            "alarms": self._alarms(frame, load, wire, goal),
+            "alarms": self._alarms(frame, load, wire, alarm),
             # At every start the rig has been without a station for a while: no alarm, but to be known.
             "notices": [STATION_LOST_WORDS] if wire.notice == STATION_LOST else [],
         }
@@ -160,18 +164,16 @@ class Panel:
         unit = next((c.unit for c in self.session.channels if c.name == p.reference), "")
         return {"peak": finite(abs(p.amplitude[p.channels.index(p.reference)]), 4), "unit": unit}
 
-    def _performance(self, frame: Frame, goal: TuningGoal) -> dict[str, Any] | None:
+    def _performance(self, frame: Frame) -> dict[str, Any] | None:
         p = frame.performance
         if p is None:
-            self._spent.clear()
             return None
-        self._spent.append(p.powers.of_kind(goal.budget_kind))
         return {
             "displacement_m": finite(p.displacement_m),
             "passive_m": finite(p.passive_m),
             "limit_m": finite(p.limit_m),
             "current_peak_a": finite(p.current_peak_a),
-            "power_w": finite(sum(self._spent) / len(self._spent)),
+            "power_w": finite(self._watch.spent_w),
             **power_figures(p.powers),
         }
 
@@ -183,7 +185,7 @@ class Panel:
         hz = [p.frequency_hz for _, p in standing.proposal.points]
         return {"number": number, "from_hz": min(hz), "to_hz": max(hz), "points": len(standing.steps)}
 
-    def _alarms(self, frame: Frame, load: float, wire: WireState, goal: TuningGoal) -> list[str]:
+    def _alarms(self, frame: Frame, load: float, wire: WireState, alarm: tuple[AlarmState, str]) -> list[str]:
         found = []
         if wire.notice and wire.notice != STATION_LOST:
             found.append(f"Rig: {wire.notice}")
@@ -191,19 +193,12 @@ class Panel:
             found.append(f"Model {frame.health.verdict}: {frame.health.reason}")
         if load > TIGHT_SHARE:
             found.append(f"The loop needs {100 * load:.0f} % of a block's time")
-        p = frame.performance
-        spent = sum(self._spent) / len(self._spent) if self._spent else 0.0
-        if spent > 1.15 * goal.budget_w:
-            found.append(f"Power {spent:.3g} W over the budget of {goal.budget_w:.3g} W")
-        limit = self._current_limit()
-        if p is not None and p.current_peak_a > 0.98 * limit:
-            found.append(f"Coil current {p.current_peak_a:.2f} A at its limit {limit:g} A")
+        state, words = alarm
+        if state != "none":
+            found.append(
+                f"{'Power over budget' if state == 'over budget' else 'Current at its limit'}: {words}"
+            )
         return found
-
-    def _current_limit(self) -> float:
-        plant = self.session.plant
-        coil = plant.voice_coil
-        return math.inf if coil is None else plant.limits.get(f"{coil.name}_current_a", math.inf)
 
     def _note(self, frame: Frame) -> None:
         block = frame.block

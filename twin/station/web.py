@@ -1,13 +1,16 @@
 """Rerun's web viewer from the installed package, served to this machine's browser and to nothing else.
 
 Rerun can serve it too, but then to every interface, and its page fetches fonts and a telemetry script from
-elsewhere. Here a content security policy leaves the page nothing but this server and the run's own stream.
+elsewhere. Here a content security policy leaves the page nothing but this server and the run's own stream, and a
+token as that of the operator's page is asked for.
 """
 
 import base64
 import contextlib
 import hashlib
+import logging
 import re
+import secrets
 import socket
 import subprocess
 import tempfile
@@ -21,13 +24,12 @@ from urllib.parse import quote, urlsplit
 
 import rerun as rr
 import uvicorn
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, RedirectResponse
-from starlette.middleware.base import RequestResponseEndpoint
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from twin.plant.errors import InputError, RunError
 from twin.rig.rerun_tool import rerun_environment, rerun_program
+from twin.station.guard import Guard
 from twin.station.native import MEMORY_LIMIT, Broadcast, free_port
 
 MEDIA_TYPES = {
@@ -65,7 +67,7 @@ class WebViewer:
         self._thread: threading.Thread | None = None
 
     def start(self, port: int = 0) -> str:
-        """Start serving and return the URL to open.
+        """Start serving and return the URL to open, its token with it.
 
         Parameters
         ----------
@@ -80,7 +82,7 @@ class WebViewer:
             If the server does not come up.
         """
         fetch_viewer(Path(self._files.name))
-        listener = socket.socket()
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((_HOST, port))
@@ -88,9 +90,21 @@ class WebViewer:
             listener.close()
             raise InputError(f"port {port} cannot be used ({error.strerror}); give another one") from error
         port = int(listener.getsockname()[1])
-        page = f"http://{_HOST}:{port}"
-        self.source = Broadcast(self._stream, self._memory_limit, [page]).url
-        app = viewer_app(Path(self._files.name), self.source)
+        hosts = [f"{name}:{port}" for name in (_HOST, "localhost")]
+        page, token = f"http://{hosts[0]}", secrets.token_urlsafe(24)
+        self.source = Broadcast(self._stream, self._memory_limit, [f"http://{host}" for host in hosts]).url
+        files = Path(self._files.name)
+        app = Guard(
+            viewer_app(files, self.source),
+            token,
+            hosts,
+            security_policy(
+                (files / "index.html").read_text(encoding="utf-8"), urlsplit(self.source).port or 0
+            ),
+            logging.getLogger(__name__).info,
+            f"atmdview{port}",
+            framed=True,
+        )
         self._server = uvicorn.Server(
             uvicorn.Config(app, log_level="warning", lifespan="off", access_log=False)
         )
@@ -103,7 +117,7 @@ class WebViewer:
             if not self._thread.is_alive() or time.monotonic() > deadline:
                 raise RunError(f"the web viewer's server at {page} did not start; try another port")
             time.sleep(0.02)
-        return f"{page}/"
+        return f"{page}/?token={token}"
 
     def stop(self) -> None:
         """Stop serving; browsers keep what they have."""
@@ -118,19 +132,7 @@ class WebViewer:
 def viewer_app(files: Path, source: str) -> FastAPI:
     """Application that serves the viewer's files; ``/`` opens it on the stream at that URL."""
     app = FastAPI(title="atmd", docs_url=None, redoc_url=None, openapi_url=None)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
-    policy = security_policy((files / "index.html").read_text(encoding="utf-8"), urlsplit(source).port or 0)
     stream_url = quote(source, safe="")
-
-    @app.middleware("http")
-    async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
-        """Add the headers that keep the page to itself."""
-        response = await call_next(request)
-        response.headers["Content-Security-Policy"] = policy
-        response.headers["X-Content-Type-Options"] = "nosniff"
-        response.headers["Referrer-Policy"] = "no-referrer"
-        response.headers["Cache-Control"] = "no-cache"
-        return response
 
     @app.get("/")
     def home() -> RedirectResponse:
@@ -141,7 +143,10 @@ def viewer_app(files: Path, source: str) -> FastAPI:
         # Only names from the table ever reach the file system.
         if name not in MEDIA_TYPES or not (files / name).is_file():
             return Response(status_code=404)
-        return FileResponse(files / name, media_type=MEDIA_TYPES[name])
+        # To be asked for again each time, but not sent again: it is 40 MB.
+        return FileResponse(
+            files / name, media_type=MEDIA_TYPES[name], headers={"Cache-Control": "private, no-cache"}
+        )
 
     return app
 
@@ -161,7 +166,7 @@ def security_policy(page: str, data_port: int) -> str:
         "font-src": "'self' data:",
         "worker-src": "'self' blob:",
         "connect-src": f"'self' http://{_HOST}:{data_port}",
-        "frame-ancestors": f"'self' http://{_HOST}:*",
+        "frame-ancestors": f"'self' http://{_HOST}:* http://localhost:*",
         "base-uri": "'none'",
         "form-action": "'none'",
     }

@@ -87,13 +87,20 @@ async function branch() {
 }
 
 // --- Rerun's viewer ---
+// Browsers keep its cookie for the host it was set by: it is asked for under the name this page was.
+function viewerUrl() {
+  const url = new URL(state.viewer_url);
+  if (location.hostname === "localhost") url.hostname = "localhost";
+  return url.href;
+}
+
 function openViewer(open) {
   const button = $("show-viewer");
   if (open === (button.getAttribute("aria-expanded") === "true")) return;
   button.setAttribute("aria-expanded", String(open));
   button.textContent = open ? "Hide the signals" : "Show the signals here";
   $("viewer-frame").replaceChildren();
-  if (open) $("viewer-frame").append(Object.assign(document.createElement("iframe"), { src: state.viewer_url, title: "Rerun viewer: signals of rig and twin" }));
+  if (open) $("viewer-frame").append(Object.assign(document.createElement("iframe"), { src: viewerUrl(), title: "Rerun viewer: signals of rig and twin" }));
 }
 
 // Drawn by a graphics processor the viewer is there from the start; drawn by the processor that runs the loop only on demand.
@@ -105,11 +112,12 @@ function drawnInSoftware() {
   return !gl || /swiftshader|llvmpipe|software|basic render/i.test(renderer);
 }
 
-function offerViewer(url) {
+function offerViewer() {
+  const url = viewerUrl();
   $("viewer").hidden = false;
   $("viewer-link").href = url;
   const local = (host) => ["127.0.0.1", "localhost", "[::1]"].includes(host);
-  if (local(new URL(url, location.href).hostname) && !local(location.hostname)) {
+  if (local(new URL(url).hostname) && !local(location.hostname)) {
     put("viewer-note", "Only on the station's own machine.");
     $("show-viewer").hidden = $("viewer-link").hidden = true;
   } else if (drawnInSoftware()) put("viewer-note", "This browser draws without a graphics processor: it will be slow.");
@@ -145,7 +153,7 @@ function take(s) {
     const now = `now ${number(s.excitation.peak)}`;
     if ($("excitation").placeholder !== now) $("excitation").placeholder = now;
   }
-  if (s.viewer_url && $("viewer").hidden) offerViewer(s.viewer_url);
+  if (s.viewer_url && $("viewer").hidden) offerViewer();
 }
 
 $("controls").addEventListener("input", (event) => {
