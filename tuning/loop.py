@@ -6,8 +6,8 @@ a delay of any length. Stability is judged by the closed loop's eigenvalues, nev
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
@@ -20,6 +20,9 @@ from twin.plant.config import Plant, Shaker
 from twin.plant.discrete import DiscreteModel, discretise
 from twin.plant.errors import RunError
 from twin.plant.linear import Array, ComplexArray, LinearModel, linear_model
+
+if TYPE_CHECKING:
+    import control
 
 WELL_CONDITIONED = 1e9
 """Eigenvectors worse than this are not trusted for responses; the state equation is then solved point by point."""
@@ -232,8 +235,10 @@ class RigModel:
         paths = self.paths(frequency_hz, low_pass_hz, high_pass_hz)
         return np.asarray(-self.acceleration(frequency_hz)[:, None] * paths)
 
-    def closed_loop(self, gains: Gains) -> control.StateSpace:
+    def closed_loop(self, gains: Gains) -> "control.StateSpace":
         """Closed loop from the reference's disturbance to the relative acceleration, for its poles."""
+        import control  # with it comes all of Matplotlib, which the processes that tune have no use for
+
         A = self.closed_loop_matrix(gains)
         n = len(self._late)
         into, out = np.zeros((len(A), 1)), np.zeros((1, len(A)))

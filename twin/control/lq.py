@@ -3,12 +3,14 @@
 ``f = -K x`` with x all bodies' displacements and then velocities. A loop with such a K keeps ``|1 + L| >= 1`` as
 long as all states are measured at once; that is also why no weights make it quiet one frequency as zero placement
 does, and why delay and a current loop, which the design does not know, may destabilise a large K.
+
+python-control is imported where it is called: it brings all of Matplotlib, 30 MB in every process that only tunes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -16,6 +18,9 @@ from twin.control.continuous import Loop, build_loop
 from twin.control.laws import actuated_pair
 from twin.plant.config import ForceActuator, Plant
 from twin.plant.linear import Array, ComplexArray, linear_model, read_only
+
+if TYPE_CHECKING:
+    import control
 
 PRIMARY_DISPLACEMENT_WEIGHT, PRIMARY_VELOCITY_WEIGHT, FORCE_WEIGHT = 1e11, 1e10, 1e-6
 """Thesis Table 6-2: weights on (x1, x1') and on the force; the absorber's states weigh nothing."""
@@ -87,6 +92,8 @@ def lq_gain(model: ForceModel, Q: ArrayLike, R: ArrayLike) -> Array:
     ValueError
         If the Riccati equation has no stabilising solution for these weights.
     """
+    import control
+
     try:
         K, _, poles = control.lqr(model.A, model.b[:, None], np.asarray(Q), np.asarray(R), method="scipy")
     except (np.linalg.LinAlgError, control.ControlArgument) as error:
@@ -104,6 +111,8 @@ def placed_observer(model: ForceModel, C: ArrayLike, K: Array, faster: float = 4
     ndarray
         (2 n, p) for the p outputs ``y = C x``, so that A - L C has the poles.
     """
+    import control
+
     measured = np.atleast_2d(np.asarray(C, dtype=np.float64))
     poles = faster * np.linalg.eigvals(model.A - np.outer(model.b, K))
     return np.asarray(control.place(model.A.T, measured.T, _apart(np.asarray(poles, dtype=np.complex128))).T)
@@ -126,6 +135,8 @@ def kalman_observer(
     ndarray
         (2 n, p).
     """
+    import control
+
     measured = np.atleast_2d(np.asarray(C, dtype=np.float64))
     # Two-sided densities are half the square of one-sided ones.
     process = np.array([[0.5 * force_density**2]])
@@ -134,8 +145,10 @@ def kalman_observer(
     return np.asarray(L, dtype=np.float64)
 
 
-def lqg_controller(model: ForceModel, C: ArrayLike, K: Array, L: Array) -> control.StateSpace:
+def lqg_controller(model: ForceModel, C: ArrayLike, K: Array, L: Array) -> "control.StateSpace":
     """Observer and gain as one controller from measured outputs to force (thesis eq. 6-14 to 6-18)."""
+    import control
+
     measured = np.atleast_2d(np.asarray(C, dtype=np.float64))
     A = model.A - np.outer(model.b, K) - L @ measured
     return control.ss(A, L, -K[None, :], np.zeros((1, len(measured))))
