@@ -325,6 +325,7 @@ def test_unstable_poles_are_counted_alike_along_the_delay_around_the_origin_and_
     poles = delayed_poles(loop, delay_s)
     assume(np.abs(poles.real).min() > scale)  # neither side of the axis in doubt
     count = unstable_poles(loop, delay_s)
+    assume(count < 1000)  # beyond, the curve that is counted along turns faster than it is sampled
     assert count == unstable_poles_by_winding(loop, delay_s)
     if count <= 8:  # more of them lie further out than the list goes
         assert count == np.count_nonzero(poles.real > 0.0)

@@ -201,7 +201,7 @@ def test_a_replay_that_is_recorded_does_not_jump() -> None:
 def test_policy_allows_no_inline_script_and_no_inline_style() -> None:
     policy = security_policy("http://127.0.0.1:9000/")
     assert "unsafe" not in policy
-    assert "frame-src http://127.0.0.1:9000;" in policy
+    assert "frame-src http://127.0.0.1:9000 http://localhost:9000;" in policy
 
 
 @pytest.mark.parametrize(("bind", "warned"), [("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)])  # noqa: S104

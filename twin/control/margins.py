@@ -103,7 +103,8 @@ def unstable_poles_by_winding(loop: Loop, delay_s: float) -> int:
     """Count closed-loop poles right of the axis by the argument principle: turns of ``1 + L e^(-s tau)`` around 0.
 
     Independent of `unstable_poles`. Needs an open loop without poles on the axis and, with a delay, a direct path
-    of magnitude below 1.
+    of magnitude below 1. Counts of a thousand and more are too low: the delay turns the curve faster, up there, than
+    it is sampled.
     """
     top = 100.0 * float(np.abs(loop.open_poles).max())
     while abs(_excess(loop, np.array([top]))[0] + 1.0) > 0.5 + 0.5 * abs(loop.d) and top < 1e12:
