@@ -168,6 +168,8 @@ class Everything:
             for one in _family(process):
                 one.resume()
             self.stopped.discard(part)
+            if part == "rig" and not self.up("station") and self.blocks and self.blocks[-1].control_on:
+                self._check_safe(self.blocks[-1])
             return
         getattr(self, f"_start_{part}")()
 
@@ -224,7 +226,7 @@ class Everything:
         process = self.processes.get(part)
         if process is None:
             return
-        watched = part == "station" and self.alive("rig") and self.blocks and self.blocks[-1].control_on
+        watched = part == "station" and self.up("rig") and self.blocks and self.blocks[-1].control_on
         if blow == "stop":
             for one in _family(process):
                 one.suspend()
